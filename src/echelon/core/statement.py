@@ -75,10 +75,6 @@ class Cause(NamedTuple):
     text: str
     remedy: str
 
-    def sentence(self) -> str:
-        """Return why nothing is guaranteed, as the live page has it."""
-        return f"Not guaranteed: {self.text}."
-
 
 @final
 @dataclasses.dataclass(frozen=True)
@@ -95,6 +91,8 @@ class Statement:
         remedy: what would be needed; empty where nothing fails.
         reason: what the failure says against any promise; empty where it leaves one.
         condition: what the claim is conditional on, since the failure leaves it to the run.
+        limit: beside which the number stands; None where there is none.
+        unit: of both.
     """
 
     statement: Line
@@ -106,6 +104,8 @@ class Statement:
     remedy: str = ""
     reason: str = ""
     condition: str = ""
+    limit: float | None = None
+    unit: str = ""
 
     def __post_init__(self) -> None:
         """Hold that nobody is left with a failure and nothing to do."""
@@ -133,16 +133,24 @@ class Statement:
 
     def as_mapping(self) -> dict[str, str | float | None]:
         """Return it ready for JSON, where a number that is not finite is None."""
-        finite = self.number is not None and abs(self.number) < float("inf")
+        value, limit = map(_finite, (self.number, self.limit))
         return {
-            "statement": self.name,
+            "name": self.name,
             "verdict": str(self.verdict),
             "kind": str(self.kind),
-            "number": self.number if finite else None,
+            "value": value,
+            "limit": limit,
+            "unit": self.unit,
             "shown": self.number_text,
             "text": self.text,
             "remedy": self.remedy,
+            "reason": self.reason,
+            "while": self.condition,
         }
+
+
+def _finite(number: float | None) -> float | None:
+    return number if number is not None and abs(number) < float("inf") else None
 
 
 def holds(

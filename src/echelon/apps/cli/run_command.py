@@ -217,9 +217,9 @@ def _print(result: "Result", as_json: bool) -> None:
         print(json.dumps(summary(result), indent=2), flush=True)
         return
     from echelon.experiments.results.metrics import metrics
-    from echelon.output.reports.run_report import print_report
+    from echelon.output.reports.run_report import print_screen
 
-    print_report(tables.console(), result, metrics(result))
+    print_screen(tables.console(), result, metrics(result))
 
 
 def _write(job: Job, result: "Result", figures: bool, quiet: bool) -> None:
@@ -234,7 +234,7 @@ def _write(job: Job, result: "Result", figures: bool, quiet: bool) -> None:
     if result.outcome.reached or result.outcome is Outcome.DIVERGED:
         job.chunks.remove()
     if not quiet:
-        tables.print_folder(job.folder)
+        tables.print_folder(job.folder, "`echelon report` prints all of it")
 
 
 def _explain(

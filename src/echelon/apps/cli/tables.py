@@ -64,7 +64,7 @@ _DESIGN: dict[str, tuple[str, Callable[[Any], Any]]] = {
     ),
     "seconds": ("seconds", lambda design: design.seconds),
     "promised": ("", lambda design: design.promise.promised),
-    "promise": ("", lambda design: design.promise.as_mapping()),
+    "guarantee": ("", lambda design: design.promise.as_mapping()),
 }
 """The numbers of a design, each with its column, if it has one, and its computation."""
 _PARTS = (
@@ -176,13 +176,17 @@ def foretell(experiment: "Experiment", quiet: bool) -> None:
     """Print the warnings of a run, and its guarantee on a terminal or if nothing is guaranteed."""
     if quiet or STATUS.silent:
         return
-    from echelon.experiments.studies.design import forecast
+    from echelon.experiments.studies.design import ways_out
     from echelon.guarantees.promises.promise import guarantee
+    from echelon.output.reports.guarantee_text import guarantee_text
     from echelon.simulation.engine.prepare import prepare
 
     warn(prepare(*experiment).warnings)
-    if sys.stderr.isatty() or not guarantee(*experiment).promised:
-        print(f"echelon: {forecast(*experiment)}", file=sys.stderr, flush=True)
+    stated = guarantee(*experiment)
+    if sys.stderr.isatty() or not stated.claimed:
+        print(f"echelon: {guarantee_text(stated)}", file=sys.stderr, flush=True)
+    for change in ways_out(*experiment):
+        print(f"  with {'':9}`--set {change}` there is a guarantee", file=sys.stderr, flush=True)
 
 
 def warn(warnings: Iterable[str], quiet: bool = False) -> None:
@@ -202,10 +206,11 @@ def print_causes(study: "CauseStudy") -> None:
         say(out, sentence)
 
 
-def print_folder(folder: Path) -> None:
-    """Print the names of all files in a folder."""
+def print_folder(folder: Path, remark: str = "") -> None:
+    """Print the names of all files in a folder, and a remark."""
     names = sorted(path.name + ("/" if path.is_dir() else "") for path in folder.iterdir())
-    print(f"- Written to {folder}: {', '.join(names)}.")
+    end = f"; {remark}." if remark else "."
+    print(f"- Written to {folder}: {', '.join(names)}{end}")
 
 
 def write_file(file: Path, content: bytes | str, remark: str = "{}") -> None:

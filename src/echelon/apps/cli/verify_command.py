@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _EXIT_CODES = {"verified": 0, "refused": 1, "incomplete": 5}
 _WIDTH = 80
 _TITLES = ("claim", "stored", "recomputed", "verdict")
-_DEPTHS = {"promise.anywhere.": 3, "promise.": 2}
+_DEPTHS = {"guarantee.anywhere.": 3, "guarantee.": 2}
 """Entries of a guarantee that are rows by themselves; of others, the first key is."""
 
 
@@ -78,11 +78,11 @@ def _advice(
     scenario: str | None,
 ) -> "Iterator[str]":
     from echelon.guarantees.verifier.agent_claims import MODEL
-    from echelon.guarantees.verifier.verify import PROMISE
+    from echelon.guarantees.verifier.verify import CLAIMED
 
     if verification.verdict == "refused":
         yield from _other_version(file, files)
-    elif any(x.open and x.claim.startswith((PROMISE, MODEL)) for x in verification.findings):
+    elif any(x.open and x.claim.startswith((CLAIMED, MODEL)) for x in verification.findings):
         if scenario is not None:
             yield f"`--scenario {scenario}`: {obstacle}."
         own = file if files.scenario is not None else "SCENARIO"

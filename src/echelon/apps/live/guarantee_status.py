@@ -21,7 +21,7 @@ from echelon.experiments.scenario.build import build
 from echelon.guarantees.promises.closed_loop import LinearLoop
 from echelon.guarantees.promises.promise import guarantee
 from echelon.output.reports.run_report import beyond
-from echelon.output.viewer.replay import promise_badge
+from echelon.output.viewer.replay import guarantee_badge
 from echelon.simulation.step.meter import SETTLED, outside
 from echelon.simulation.step.settings import Settings
 
@@ -145,9 +145,9 @@ def badge_of(panel: Panel, knobs: Knobs) -> JsonObject:
         cause = str(error).removeprefix("mapping: ")
         return {"state": "lost", "short": "no guarantee", "whole": cause, "causes": [cause]}
     stated = found.as_mapping()
-    badge: JsonObject = promise_badge(stated)
+    badge: JsonObject = guarantee_badge(stated)
     badge["apart"] = ((stated["anywhere"] or {}).get("separation") or {}).get("distance")
-    badge["causes"] = [cause.sentence() for cause in found.causes]
+    badge["causes"] = [f"Not guaranteed: {cause.text}." for cause in found.causes]
     badge["edge"], badge["end"] = found.edge, _end(panel, knobs, found.edge)
     badge["above"] = None if found.edge is None else at_least(found.edge)
     badge["rate"] = found.rate if found.promised else None

@@ -24,7 +24,7 @@ from echelon.simulation.step.settings import Settings
 if TYPE_CHECKING:
     import xarray as xr
 
-FORMAT = 4
+FORMAT = 5
 """Version of the format of `run.nc`; files of others are refused."""
 SUM = "sum_"
 """So begin the names of the sums over all steps, from which `load` computes the metrics."""
@@ -71,7 +71,7 @@ def dataset(result: Result) -> "xr.Dataset":
     `limit_matrix` u <= `limit_high`. Over a network that is late also `age` (of the oldest message
     that an agent has of a neighbour, NaN before the first), `edge_age` (of the newest one at each
     end of an edge), `edge_lost` (messages lost since the frame before) and `forget`. The attribute
-    `promise` is JSON, and `format` the version of this list.
+    `guarantee` is JSON, and `format` the version of this list.
     """
     return labelled(result).dataset()
 
@@ -199,7 +199,7 @@ def _attributes(result: Result) -> JsonObject:
         "outcome": result.outcome.name.lower(),
         "message": result.message,
         "warnings": "\n".join(result.warnings),
-        "promise": json.dumps(guarantee(result.parts, result.settings).as_mapping()),
+        "guarantee": json.dumps(guarantee(result.parts, result.settings).as_mapping()),
         **solver,
     }
 

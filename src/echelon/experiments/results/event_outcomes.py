@@ -35,7 +35,7 @@ class EventOutcome(NamedTuple):
     unit: str
     leader: tuple[int, float] | None
     near: float | None
-    guarantee: str
+    guarantee: JsonObject
     sampled: bool = False
 
     def as_mapping(self) -> JsonObject:
@@ -47,7 +47,7 @@ class EventOutcome(NamedTuple):
         """Return it in a sentence or two."""
         text = f"{self.text[0].upper()}{self.text[1:]} at {self.at:g} s"
         if self.peak is None:
-            return f"{text}, after which a state is not finite. {self.guarantee}"
+            return f"{text}, after which a state is not finite."
         limit = f"{SETTLED:g} {self.unit}".rstrip()
         size = f"{self.peak:.3g} {self.unit}".rstrip()
         if self.peak <= SETTLED:
@@ -63,7 +63,7 @@ class EventOutcome(NamedTuple):
             seen += f"; agent {agent} leads, {away} off the path at most{frames}"
         if self.near is not None:
             seen += f"; it joins {self.near:.3g} m from another agent, nearer than hulls keep"
-        return f"{text}: {seen}. {self.guarantee}"
+        return f"{text}: {seen}."
 
 
 def event_outcomes(result: Result) -> tuple[EventOutcome, ...]:
@@ -103,7 +103,7 @@ def _outcome(result: Result, event: JsonObject, span: int, steps: tuple[int, int
         unit=result.length_unit,
         leader=_new_leader(result, frames),
         near=_too_near(result, event, frames),
-        guarantee=event["guarantee"]["sentence"],
+        guarantee=event["guarantee"],
         sampled=result.settings.store_every > 1,
     )
 

@@ -17,11 +17,11 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.switching import Schedule
+from echelon.core.claim import number_in
 from echelon.core.errors import OutputError
 from echelon.core.numerics import precision
-from echelon.core.statement import Hypothesis
 from echelon.core.types import Array, JsonObject
-from echelon.core.words import Verdict, amount
+from echelon.core.words import GuaranteeVerdict, Theorem, amount
 from echelon.experiments.results.dataset import FORMAT, labelled, labelled_parts
 from echelon.experiments.results.labelled import Labelled, read_labelled
 from echelon.experiments.results.metrics import Avoidance, Ellipsoid
@@ -35,14 +35,8 @@ _AHEAD, _PLACES = 60.0, 121
 """Seconds of the reference by which the scene is sized, and the number of times in them."""
 _BLOCK = 32
 """Frames for which V is computed at once: a constant, so that it is compiled once."""
-_NO_PROMISE: JsonObject = {
-    "promised": False,
-    "rate": None,
-    "theorem": None,
-    "sentence": "",
-    "kind": "",
-    "hypotheses": (),
-}
+_NOT_COMPUTED: JsonObject = {}
+"""The guarantee of a run for which none was computed."""
 
 
 class InputBounds(NamedTuple):
@@ -116,7 +110,7 @@ class Recording(FrameNumbers):
         modes: None where the laws have no linearization.
         messages: over a network; None in the ideal one.
         avoidance: how agents kept apart, without slices before they did; None where they do not.
-        promise: as `Guarantee.as_mapping` returns it.
+        guarantee: as `Guarantee.as_mapping` returns it; empty where none was computed.
         horizon, dt: s.
         attributes: provenance and settings, as stored.
         events: what happened, by time: `at` (s), `what`, `agents`, `until` (s) and `text`.
@@ -151,7 +145,7 @@ class Recording(FrameNumbers):
     modes: LoopPoles | None
     messages: MessageAges | None
     avoidance: Avoidance | None
-    promise: JsonObject
+    guarantee: JsonObject
     horizon: float
     dt: float
     attributes: JsonObject
@@ -218,7 +212,8 @@ class Recording(FrameNumbers):
     @property
     def rate(self) -> float | None:
         """The rate at which errors are guaranteed to decay, 1/s; None where none is guaranteed."""
-        return self.promise["rate"] or None if self.promise["promised"] else None
+        held = self.guarantee.get("verdict") == str(GuaranteeVerdict.GUARANTEED)
+        return number_in(self.guarantee, "rate") or None if held else None
 
     def error_bound(self) -> Float[np.ndarray, " T"] | None:
         """Return the bound of a theorem on every formation error; None where no theorem applies.
@@ -228,18 +223,13 @@ class Recording(FrameNumbers):
         delta'P delta <= S, the norm of the measured part is at most the root of S times the largest
         eigenvalue of that block of P^-1.
         """
-        promise, certified = self.promise, self.promise.get("certified_set")
-        verdicts = {x["statement"]: x["verdict"] for x in promise["hypotheses"]}
+        stated = self.guarantee
         # While no limit acts, which is looked at here, a conditional claim holds as well.
-        rate = promise["rate"]
-        claimed = promise["promised"] or bool(promise.get("conditions"))
-        proved = claimed and promise["theorem"] == "T1" and certified is not None
-        proved = proved and rate is not None
-        covered = verdicts.get(Hypothesis.STARTS.value) == str(Verdict.HOLDS)
-        if not (proved and covered) or self.metric is None:
+        proved = stated.get("claim") is not None and stated["theorem"] == str(Theorem.T1)
+        if not (proved and stated["covers_start"]) or self.metric is None:
             return None
-        disturbed = verdicts.get(Hypothesis.EXACT_STATES.value) == str(Verdict.FAILS)
-        if self.saturated.any() or disturbed:
+        rate = number_in(stated, "rate")
+        if rate is None or self.saturated.any() or stated["ignores"]:
             return None
         first = self.deviations([0])[0]
         start = float(np.einsum("ia,ab,ib->", first, self.metric, first))
@@ -337,7 +327,7 @@ def recording(arrays: Mapping[str, np.ndarray], attributes: JsonObject) -> Recor
         messages=_messages(arrays),
         avoidance=_avoidance(arrays),
         events=tuple(json.loads(attributes.get("events", "[]"))),
-        promise=json.loads(attributes["promise"]),
+        guarantee=json.loads(attributes["guarantee"]),
         horizon=float(attributes["horizon"]),
         dt=float(attributes["dt"]),
         attributes=dict(attributes),
@@ -402,7 +392,7 @@ def empty_recording(
     settings: Settings,
     states: Float[Array, "N n"],
     name: str,
-    promise: JsonObject = _NO_PROMISE,
+    stated: JsonObject = _NOT_COMPUTED,
 ) -> Recording:
     """Return a recording of agents that stay at their goals, by which the scene is sized."""
     model, fixed = parts.model, labelled_parts(parts, settings)
@@ -419,7 +409,7 @@ def empty_recording(
     if parts.formation.motion is not None:
         frames["moving_offset"] = parts.formation.offsets_at(times)
     attributes = {"scenario": name, "outcome": "completed", "message": ""}
-    attributes["promise"] = json.dumps(promise)
+    attributes["guarantee"] = json.dumps(stated)
     return recording(fixed.arrays() | frames, fixed.attributes | attributes)
 
 

@@ -47,7 +47,7 @@ def statement(parts: Parts, settings: Settings, name: str) -> JsonObject:
         **parts.world.describe(parts.model),
         "gain": _gain_numbers(gain),
         "leader_gain": _gain_numbers(leader_gain_of(parts.drive)),
-        "promise": guarantee(parts, settings).as_mapping(),
+        "guarantee": guarantee(parts, settings).as_mapping(),
         **({"events": events_in_words(parts, guarantee(parts, settings))} if parts.events else {}),
         "lambda_min": spectrum.low,
         "lambda_max": spectrum.high,
@@ -83,8 +83,12 @@ def summary(result: Result, numbers: Metrics | None = None) -> JsonObject:
     stated = guarantee(result.parts, result.settings)
     keys = {name: quantity.key or name for name, quantity in AGENT_NUMBERS.items()}
     outcomes = [outcome.as_mapping() for outcome in event_outcomes(result)]
+    observed = RunNumbers(result, numbers, stated).json(Appearance.SUMMARY)
+    follows = statement(result.parts, result.settings, name)
     return {
-        **statement(result.parts, result.settings, name),
+        **follows,
+        # What follows from the parts, and whether this run kept to it.
+        "guarantee": {**follows["guarantee"], "covered": observed["covered"]},
         "outcome": {"name": result.outcome.name.lower(), "message": result.message},
         "leader": numbers.leader._asdict(),
         "leaders": [leader._asdict() for leader in numbers.leaders],
@@ -96,7 +100,7 @@ def summary(result: Result, numbers: Metrics | None = None) -> JsonObject:
             {"edge": list(row.edge), "distance_rmse": row.distance_rmse}
             for row in _listed(numbers.edges, distance_error)
         ],
-        **RunNumbers(result, numbers, stated).json(Appearance.SUMMARY),
+        **{k: x for k, x in observed.items() if k != "covered"},
         **({"event_outcomes": outcomes} if result.parts.events else {}),
         "steady_window_s": numbers.steady_window,
         "warnings": list(result.warnings),

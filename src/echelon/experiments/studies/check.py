@@ -204,7 +204,7 @@ class CheckResult(NamedTuple):
         """Return it ready for JSON."""
         lines = [line.as_mapping() for line in self.lines]
         warnings = list(self.warnings)
-        stated = {"promise": self.promise.as_mapping(), "lines": lines, "warnings": warnings}
+        stated = {"guarantee": self.promise.as_mapping(), "lines": lines, "warnings": warnings}
         region = {} if self.region is None else {"region": self.region.as_mapping()}
         return stated | region
 

@@ -277,8 +277,8 @@ _SHARE = 0.9
 """Share of the longest stable step for the checked modes, since further modes lie between them."""
 
 
-def forecast(parts: Parts, settings: Settings) -> str:
-    """Return the guarantee of a run; without one, with options under which there is one.
+def ways_out(parts: Parts, settings: Settings) -> tuple[str, ...]:
+    """Return changes of a scenario under which something is guaranteed, where errors grow.
 
     Raises:
         EchelonError: a part is malformed or does not fit the others.
@@ -287,10 +287,7 @@ def forecast(parts: Parts, settings: Settings) -> str:
     hypotheses = Hypothesis.DISAGREEMENT_DECAY, Hypothesis.SAMPLING
     # A step that is too long for a short time only has no reason.
     grows = any(stated.hypotheses[hypothesis].reason for hypothesis in hypotheses)
-    changes = " or ".join(f"`--set {change}`" for change in _changes(parts, settings) if grows)
-    if not changes:
-        return stated.sentence()
-    return f"{stated.sentence()} There is a guarantee with {changes}."
+    return tuple(_changes(parts, settings)) if grows else ()
 
 
 def _changes(parts: Parts, settings: Settings) -> Iterator[str]:

@@ -16,6 +16,7 @@ import scipy.sparse.linalg as spla
 from echelon.agents.models.model import position_unit
 from echelon.agents.network.channel import Channel, Network
 from echelon.agents.network.graph import Graph
+from echelon.core.claim import Number, Rounding
 from echelon.core.digits import about, at_least, at_most
 from echelon.core.enclosure.interval import ELEMENTARY, point
 from echelon.core.numerics import precision
@@ -212,7 +213,7 @@ def longest_ways(L: sp.csr_array) -> Array | None:
 # ---- the theorem ---------------------------------------------------------------------------------
 
 _ONE_WAY = (
-    "With one-way edges, or `follower.hears: leaderward`, messages of any age would cost a delay "
+    "with one-way edges, or `follower.hears: leaderward`, messages of any age would cost a delay "
     "alone"
 )
 OFF_PLAN = 0.01
@@ -315,31 +316,29 @@ class LateMessages(NamedTuple):
             "weight_ratio": None if v is None else float(v.max() / v.min()),
         }
 
-    def faster(self) -> str:
-        """Return at what rate all but a few runs agree, as the end of a sentence."""
-        if self.ways is None and not self.ages.lost:
-            return f", as no message in use is older than {at_least(1e3 * self.age)} ms"
-        if self.quick is None:
-            return ""
-        text = f", and at {at_most(self.quick)} 1/s while no message in use is older than "
-        return f"{text}{at_most(1e3 * self.age)} ms"
-
-    def sentence(self, arrival: float | None) -> str:
-        """Return what is guaranteed beside rates, in sentences; the arrival (s) where known."""
-        ages, text = self.ages, "Once everybody has a packet no stopping point moves farther from "
-        text += "the leader's than the farthest one was"
+    def numbers(self) -> dict[str, Number]:
+        """Return what is known of the messages of all but one run in a million."""
+        ages, numbers = self.ages, dict[str, Number]()
+        if self.ways is None and not ages.lost:
+            numbers["message_age"] = Number(1e3 * self.age, "ms", Rounding.UP)
+        elif self.quick is not None:
+            numbers["message_age"] = Number(1e3 * self.age, "ms", Rounding.DOWN)
+            numbers["quick_rate"] = Number(self.quick, "1/s", Rounding.DOWN)
         if ages.first_packet is None:
-            return f"{text}. A link may lose all messages of a run"
-        few = f"In all but one run in a million no link loses more than {ages.lost} in a row, e"
-        text += f". {few if ages.lost else 'E'}verybody has a packet"
-        text += " and knows its hops" * self.leaderward + f" after {at_least(ages.first_packet)} s"
+            return numbers
+        numbers["first_packet"] = Number(ages.first_packet, "s", Rounding.UP)
+        numbers["lost_in_a_row"] = Number(float(ages.lost or 0))
         late = 0.0 if self.ways is None else float(self.ways.max() - 1) * self.age
-        text += f"; messages then cost a delay of {at_least(late)} s at most" * bool(late)
-        if arrival is not None:
-            text += f", and from these starts all stay within 1 cm after {at_least(arrival)} s"
+        return numbers | ({"delay": Number(late, "s", Rounding.UP)} if late else {})
+
+    def notes(self) -> tuple[str, ...]:
+        """Return what else is known, a phrase each."""
+        text = "with a packet no stopping point moves farther from the leader's than any was before"
+        if self.ages.first_packet is None:
+            return text, "a link may lose all messages of a run"
         # Without ages agreement is at least as fast as c / max w.
         slow = self.ways is None and 2.0 * self.rate < self.coupling / self.spread
-        return f"{text}. {_ONE_WAY}" if slow else text
+        return (text, *[_ONE_WAY] * slow)
 
 
 def late_messages_of(

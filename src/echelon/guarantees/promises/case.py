@@ -82,12 +82,12 @@ class GuaranteeInputs(NamedTuple):
         return slowest if slowest is not None and (unsent or apart) else -math.inf
 
     @property
-    def disturbed(self) -> str:
-        """What acts that no promise covers, in words; empty without any."""
+    def ignored(self) -> tuple[str, ...]:
+        """What acts that no guarantee covers, a phrase each."""
         world = self.parts.world
         acts = world.differences if self.local is None else world.random
         acting = [text for text, there in acts.items() if there]
         acting = [x for x in acting if not (self.over_network and x == LATE)]
         # Far from 0 its numbers are centimetres apart, whatever a law does.
         acting += ["numbers have single precision"] * (self.settings.precision == "float32")
-        return " and ".join(acting)
+        return tuple(acting)

@@ -58,7 +58,7 @@ def _against(result: Result, promise: Guarantee) -> str:
         return f"agent {left.agent} left the domain at {about(left.time, 4)} s (`{left.name}`)"
     if limited:
         return f"a limit acted on an agent in {about(100.0 * limited)} % of the steps"
-    return promise.without
+    return " and ".join(promise.ignores)
 
 
 def _unseen(result: Result, promise: Guarantee) -> bool:

@@ -30,7 +30,7 @@ from echelon.core.statement import (
     unneeded,
 )
 from echelon.core.types import Array, JsonObject, States
-from echelon.core.words import Kind
+from echelon.core.words import GuaranteeVerdict, Kind
 from echelon.guarantees.messages.late_messages import bias_line
 from echelon.guarantees.promises.case import GuaranteeInputs
 from echelon.guarantees.promises.leaders import apart
@@ -144,10 +144,10 @@ def _forced_off_trim(actuator: Actuator | None, plant: ControlAffine, trim: Arra
 
 def _exact(case: GuaranteeInputs) -> Statement:
     """Assumption 3: states are known exactly, and nothing acts that no law asked for."""
-    if not case.disturbed:
+    if not case.ignored:
         text = "states are known exactly, and nothing disturbs the agents"
         return holds(Hypothesis.EXACT_STATES, Kind.PROOF, text)
-    text = f"{case.disturbed}; the guarantee ignores this"
+    text = f"{' and '.join(case.ignored)}; the guarantee ignores this"
     return fails(
         Hypothesis.EXACT_STATES, Kind.PROOF, text, remedy="leave it out to see what it costs"
     )
@@ -269,8 +269,6 @@ def _leaving(case: GuaranteeInputs) -> Iterator[Statement]:
 
 # ---- events of a run -----------------------------------------------------------------------------
 
-_SEVERED = "cover", "it, as that of a graph that switches"
-_BEREFT = "hold", "for all others, who do not hear it any more"
 _WITHOUT_EVENT = "remove the event to see what is guaranteed without it"
 
 
@@ -334,21 +332,19 @@ def as_mapping(event: Event) -> JsonObject:
 
 
 def _through(graph: Graph, event: Event, guarantee: Guarantee) -> JsonObject:
+    """Return whether a guarantee covers an event, and why not."""
     why = uncovered(graph, event)
-    if why or not guarantee.promised:
-        text = f"Nothing is guaranteed through it: {why}." if why else "Nothing is guaranteed."
-        if not why and guarantee.conditions:
-            conditions = " and ".join(guarantee.conditions)
-            text = f"Not guaranteed: the claim covers it while {conditions}. {guarantee.ignored()}"
-            text = text.rstrip()
-        return {"promised": False, "kind": None, "sentence": text}
-    verb, what = _SEVERED if isinstance(event, Cut) else _BEREFT
-    if guarantee.without:
+    verdict = GuaranteeVerdict.NONE if why else guarantee.verdict
+    if guarantee.ignores and verdict is GuaranteeVerdict.GUARANTEED:
         # It is of another flight, and covers nothing of this one.
-        text = f"The guarantee would {verb} {what}. {guarantee.ignored()}"
-        return {"promised": False, "kind": None, "sentence": text}
-    text = f"The guarantee {verb}s {what}."
-    return {"promised": True, "kind": str(guarantee.kind), "sentence": text}
+        verdict = GuaranteeVerdict.NONE
+    return {
+        "verdict": str(verdict),
+        "kind": str(guarantee.kind) if verdict is GuaranteeVerdict.GUARANTEED else None,
+        "against": why,
+        "conditions": list(guarantee.conditions) if not why else [],
+        "ignores": list(guarantee.ignores) if not why and guarantee.claimed else [],
+    }
 
 
 # ---- limits of the inputs ------------------------------------------------------------------------

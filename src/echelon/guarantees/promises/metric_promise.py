@@ -9,6 +9,7 @@ from typing import cast, final
 import numpy as np
 
 from echelon.agents.models.linearization import at_trim
+from echelon.core.claim import Claim, ClaimKind, Number, Rounding
 from echelon.core.digits import about, at_most
 from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
@@ -138,7 +139,7 @@ class MetricPromise(Guarantee):
         return cls(
             loop=loop,
             hypotheses=MappingProxyType({cast(Hypothesis, x.statement): x for x in lines}),
-            without=case.disturbed,
+            ignores=case.ignored,
             leader_mode=None if leaders.rest else leaders.slowest,
             region=certificate,
             certified=certified,
@@ -197,48 +198,37 @@ class MetricPromise(Guarantee):
         """Return the longest step (s) with which modes decay at the trim."""
         return self.loop.longest_step(settings)
 
-    @property
-    def condition(self) -> str:
-        """What is asked of the leader, in words; empty for nothing."""
-        return "" if self.case.matched else ", once the leader's input rests at its trim"
-
-    def guarantee(self) -> str:
-        """Return what is guaranteed near the trim, and what the region adds."""
-        if self.region is None or self.case.smooth:
-            text = "Local guarantee (linearization)" if self.promised else "By linearization"
-            text += ": followers converge to their goals from "
-            text += "sufficiently close starts, with the leader sufficiently close to the trim"
-            text += f"{self.turns}{self.condition}"
-        else:
-            text = "Guaranteed on a domain only: the model is not differentiable at the trim, so "
-            text += "the slopes on all of its sides are used"
-        if self.region is None:
-            return f"{text}; how close is not known."
-        return f"{text}. {self._regional(self.region)}"
-
-    def _regional(self, region: RegionCertificate) -> str:
-        certified, condition, theorem = self.certified, self.condition, region.theorem
-        by, what = self.kind.value, f"errors shrink at {at_most(region.rate)} 1/s or faster"
-        what = "V does not increase" if theorem is Theorem.A5 else what
+    def claim(self) -> Claim:
+        """Return what is claimed near the trim, and what the region adds."""
+        region, close = self.region, "starts close to the goals; how close is not known"
+        premises = () if self.case.matched else ("the leader's input rests at its trim",)
+        numbers = {}
+        if region is None:
+            if Hypothesis.LEADER not in self.hypotheses:
+                premises = (f"the leader stays close to the trim{self.turns}", *premises)
+            return Claim(ClaimKind.CONVERGES, (close,), premises=premises)
+        what = ClaimKind.BOUNDED if region.theorem is Theorem.A5 else ClaimKind.CONVERGES
+        certified = self.certified
         if certified is None:
-            text = f"small {what}{condition}, while the leader stays in {self.domain}"
-            return f"{by}: {text} ({theorem})."
+            premises = (f"the leader stays in {self.domain}", *premises)
+            return Claim(what, ("starts close to the goals",), premises=premises)
         if not certified.radius:
-            text = f"for as long as all agents stay in {self.domain} ({theorem}), and no start is "
-            text += f"certified to stay: {certified.why}; {certified.remedy}."
-            return f"{by}: {what}{condition}, {text}"
-        read = "" if certified.kind is self.kind else ", if the leader moves as in a run of its own"
-        start = f"any start with sum_i delta_i'P delta_i <= {at_most(certified.radius)}^2"
-        start = "everywhere" if certified.radius == float("inf") else start
-        return f"{by}: from {start}, {what}{condition}{read} ({theorem})."
+            start = (f"any, for as long as all agents stay in {self.domain}",)
+            notes = (f"no start is certified to stay: {certified.why}", certified.remedy)
+            return Claim(what, start, premises=premises, notes=notes)
+        if certified.kind is not self.kind:
+            premises = ("the leader moves as in a run of its own", *premises)
+        start = "everywhere"
+        if math.isfinite(certified.radius):
+            numbers = {"set_radius": Number(certified.radius, "", Rounding.DOWN)}
+            start = f"sum_i delta_i'P delta_i <= {at_most(certified.radius)}^2"
+        return Claim(what, (start,), premises=premises, numbers=numbers)
 
     def why_covered(self) -> str:
         """Return why a run is covered that stayed in the domain."""
         if self.theorem is Theorem.T2:
             return "the leader stayed in the domain, and small errors about it shrink"
         starts = self.hypotheses[Hypothesis.STARTS]
-        if starts.fails:
-            text = f"the starts lie outside of the certified set ({starts.number_text}), but all "
-            return f"{text}agents stayed in the domain at every stored frame"
-        text = f"the starts lie in the certified set ({starts.number_text}), and all agents stayed "
-        return f"{text}in the domain"
+        where = "outside of" if starts.fails else "in"
+        text = f"the starts lie {where} the certified set ({starts.number_text})"
+        return f"{text}, and all agents stayed in the domain"

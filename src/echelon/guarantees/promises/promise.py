@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 from weakref import WeakKeyDictionary
 
 from echelon.core.cache import load_or_compute
-from echelon.core.digits import at_most
+from echelon.core.claim import Claim, Number, Rounding
 from echelon.core.errors import EchelonError
 from echelon.core.identity import foreign_key
 from echelon.core.numerics import precision
@@ -40,8 +40,6 @@ REQUIRED = (
     Hypothesis.CLAIMS,
 )
 """Hypotheses that every guarantee has a line on, beside those on agents and leaders."""
-_NOTED = (Hypothesis.CLAIMS, Hypothesis.MESSAGES, Hypothesis.OWN_STATE)
-"""What a sentence adds where it fails and leaves a guarantee."""
 _BEHIND_GROWTH = (Hypothesis.DETECTABLE, Hypothesis.COUPLING)
 
 
@@ -69,7 +67,7 @@ class Guarantee(abc.ABC):
         loop: near the trim; what margins are taken of.
         hypotheses: each with its verdict, its number and what would be needed; those on agents and
             leaders and the `REQUIRED` ones are always there.
-        without: what acts on the agents that is left out, in words; empty without any.
+        ignores: what acts on the agents that is left out, a phrase each.
         leader_mode: the leader's slowest mode by itself, 1/s; None where it follows nothing.
         region: what is guaranteed on a domain; None without one.
         certified: the set of starts that the region certifies; None without one.
@@ -81,7 +79,7 @@ class Guarantee(abc.ABC):
 
     loop: LinearLoop
     hypotheses: Mapping[Hypothesis, Statement]
-    without: str
+    ignores: tuple[str, ...]
     leader_mode: float | None
     region: RegionCertificate | None = None
     certified: CertifiedSet | None = None
@@ -137,8 +135,8 @@ class Guarantee(abc.ABC):
         """Return the longest step (s) with which modes decay at the trim and wherever agents go."""
 
     @abc.abstractmethod
-    def guarantee(self) -> str:
-        """Return what is guaranteed, in sentences, where anything is."""
+    def claim(self) -> Claim:
+        """Return what is claimed, where anything is."""
 
     @abc.abstractmethod
     def why_covered(self) -> str:
@@ -231,55 +229,48 @@ class Guarantee(abc.ABC):
         rest = (x for x in rest if not why or x.statement is not Hypothesis.DISAGREEMENT_DECAY)
         return (*why, *(line.cause for line in rest))
 
-    def sentence(self) -> str:
-        """Return what is guaranteed, in sentences, and no more than that."""
-        text = self.guarantee() if self.claimed else self._against()
-        if self.conditions:
-            text = f"Not guaranteed: this holds while {' and '.join(self.conditions)}. {text}"
-        if self.claimed and self.without:
-            text += f" {self.ignored()}"
-        noted = (self.hypotheses.get(name) for name in _NOTED)
-        notes = (f" Note: {x.explanation}." for x in noted if x and x.fails and not x.reason)
-        return text + "".join(notes)
-
-    def ignored(self) -> str:
-        """Return what the guarantee leaves out of what acts, in a sentence; empty for nothing."""
-        what = "claim" if self.conditions else "guarantee"
-        return f"The {what} ignores that {self.without}." if self.without else ""
-
-    def _against(self) -> str:
-        """Return all that stands against a guarantee, and what would help."""
-        against = (line for line in self.hypotheses.values() if line.fails and line.reason)
-        remedies = "; ".join(dict.fromkeys(x.remedy for x in against))
-        until = "" if self.prefix is None else f" {self.prefix.sentence()}"
-        first = self.prefix if self.prefix and self.prefix.promise.promised else None
-        which = "" if first is None else f" from {at_most(first.at, 6)} s on"
-        text = f"Nothing is guaranteed{which}: {'; '.join(self.reasons)}. "
-        return f"{text}What would help: {remedies}.{until}"
+    @property
+    def covers_start(self) -> bool | None:
+        """Whether the claim is of these starts; None where it is of starts that are close."""
+        line = self.hypotheses.get(Hypothesis.STARTS)
+        known = {Verdict.HOLDS: True, Verdict.FAILS: False}
+        return None if line is None or not self.claimed else known.get(line.verdict)
 
     def as_mapping(self) -> dict[str, Any]:
         """Return it ready for JSON; what does not exist is None."""
-        certificate, certified = self.loop.certificate, self.certified
+        certified, claim = self.certified, self.claim() if self.claimed else None
         return {
             "verdict": str(self.verdict),
-            "promised": self.promised,
-            "sentence": self.sentence(),
-            "reasons": list(self.reasons),
-            "conditions": list(self.conditions),
+            "claim": None if claim is None else str(claim.what),
             "theorem": None if self.theorem is None else str(self.theorem),
             "kind": str(self.kind),
-            "rate": self.rate,
-            "slowest_mode": self.slowest,
-            "coupling": self.coupling,
-            "edge": self.edge,
-            "lambda_min": certificate.lambda_min,
-            "lambda_max": certificate.lambda_max,
+            "start": [] if claim is None else list(claim.start),
+            "graphs": [] if claim is None else list(claim.graphs),
+            "premises": [] if claim is None else list(claim.premises),
+            "notes": [] if claim is None else list(claim.notes),
+            "numbers": {name: x.as_mapping() for name, x in self._numbers(claim).items()},
+            "conditions": [line.as_mapping() for line in self.hypotheses.values()],
+            "ignores": list(self.ignores) if self.claimed else [],
+            "covers_start": self.covers_start,
             "domain": self.domain or None,
             "certified_set": None if certified is None else certified.as_mapping(),
             "anywhere": self.anywhere(),
-            "hypotheses": [line.as_mapping() for line in self.hypotheses.values()],
-            **({} if self.prefix is None else {"prefix": self.prefix.as_mapping()}),
+            "until": None if self.prefix is None else self.prefix.as_mapping(),
         }
+
+    def _numbers(self, claim: Claim | None) -> dict[str, Number]:
+        """Return the numbers of the loop and of the claim, each by one name."""
+        certificate = self.loop.certificate
+        numbers = {
+            "rate": (self.rate, "1/s", Rounding.DOWN),
+            "slowest_mode": (self.slowest, "1/s", Rounding.UP),
+            "coupling": (self.coupling, "", Rounding.NEAREST),
+            "edge": (self.edge, "", Rounding.UP),
+            "lambda_min": (certificate.lambda_min, "", Rounding.NEAREST),
+            "lambda_max": (certificate.lambda_max, "", Rounding.NEAREST),
+        }
+        known = {name: Number(*x) for name, x in numbers.items() if x[0] is not None}  # pyright: ignore
+        return {**known, **({} if claim is None else claim.numbers)}
 
 
 class Prefix(NamedTuple):
@@ -290,11 +281,7 @@ class Prefix(NamedTuple):
 
     def as_mapping(self) -> dict[str, Any]:
         """Return it ready for JSON."""
-        return {"at": self.at, "promise": self.promise.as_mapping()}
-
-    def sentence(self) -> str:
-        """Return it in a sentence."""
-        return f"Until {at_most(self.at, 6)} s: {self.promise.sentence()}"
+        return {"at": self.at, "guarantee": self.promise.as_mapping()}
 
 
 Promises: TypeAlias = Iterator[Guarantee | EchelonError]
@@ -334,11 +321,11 @@ def guarantee(parts: Parts, settings: Settings) -> Guarantee:
     return stored or _computed(prepare(parts, settings), parts, settings)
 
 
-def guaranteed(parts: Parts, settings: Settings) -> str:
-    """Return the sentence of `promise`, from the disk cache if another process computed it.
+def guarantee_data(parts: Parts, settings: Settings) -> dict[str, Any]:
+    """Return `guarantee` ready for JSON, from the disk cache if another process computed it.
 
     Raises:
-        EchelonError: as `promise`.
+        EchelonError: as `guarantee`.
     """
     # All fields of the parts, but for two that are no plain values: by what they are made of.
     fields = [getattr(parts, field.name) for field in dataclasses.fields(parts)]
@@ -346,7 +333,7 @@ def guaranteed(parts: Parts, settings: Settings) -> str:
     plain = [x for x in fields if not isinstance(x, type(formation) | type(graph))]
     links = graph.edges, graph.weights, graph.agents, graph.leaders, graph.directed, graph.schedule
     rest = formation.offsets, formation.motion, links, settings
-    return load_or_compute(lambda: guarantee(parts, settings).sentence(), __name__, plain, rest)
+    return load_or_compute(lambda: guarantee(parts, settings).as_mapping(), __name__, plain, rest)
 
 
 def promises(parts: Parts, settings: Sequence[Settings], brief: bool = False) -> Promises:

@@ -11,6 +11,7 @@ import numpy as np
 from echelon.agents.models.declarations import is_by_user, undeclared
 from echelon.agents.models.model import Airframe, ControlAffine, in_metres
 from echelon.core.cache import memoize
+from echelon.core.claim import Number, Rounding
 from echelon.core.digits import at_least, at_most
 from echelon.core.enclosure.interval import ELEMENTARY, point
 from echelon.core.rational import (
@@ -208,15 +209,15 @@ class Alone(NamedTuple):
     rate: float
     rest: bool
 
-    def sentence(self) -> str:
-        """Return the same in words."""
-        rest = ", or level and at rest" if self.rest else ""
-        tilt, rate = at_most(math.degrees(self.tilt)), at_most(self.rate)
+    def notes(self) -> tuple[str, ...]:
+        """Return the same in phrases."""
         return (
-            "any place and heading behind a leader that is on its path but for its place, if one "
-            f"thing alone differs from the leader: a tilt of {tilt} deg at its velocity, or "
-            f"{at_most(self.sideways)} m/s sideways, or {at_most(self.upward)} m/s upward, or "
-            f"{rate} rad/s of roll and pitch when level{rest}"
+            "motors suffice also from any place and heading, behind a leader on its path, if one "
+            "of these alone differs",
+            f"a tilt of {at_most(math.degrees(self.tilt))} deg at the leader's velocity",
+            f"{at_most(self.sideways)} m/s sideways, or {at_most(self.upward)} m/s upward",
+            f"{at_most(self.rate)} rad/s of roll and pitch when level",
+            *["level and at rest"] * bool(self.rest),
         )
 
 
@@ -236,13 +237,18 @@ class MotorLoad(NamedTuple):
     alone: Alone | None
     data: dict[str, object]
 
-    def sentence(self) -> str:
-        """Return what is promised of motors."""
-        text = f"From these starts each motor's thrust stays between {at_most(self.least)} and "
-        text += f"{at_least(self.largest, 4)} N (maximum {at_least(self.most, 4)} N), and the tilt "
-        text += f"is at most {at_least(math.degrees(self.tilt))} deg"
-        more = "" if self.alone is None else f"; they suffice from {self.alone.sentence()}"
-        return f"{text}{more}."
+    def numbers(self) -> dict[str, Number]:
+        """Return what is claimed of motors."""
+        return {
+            "motor_least": Number(self.least, "N", Rounding.DOWN),
+            "motor_largest": Number(self.largest, "N", Rounding.UP),
+            "motor_limit": Number(self.most, "N", Rounding.UP),
+            "tilt": Number(math.degrees(self.tilt), "deg", Rounding.UP),
+        }
+
+    def notes(self) -> tuple[str, ...]:
+        """Return from which other starts motors suffice."""
+        return () if self.alone is None else self.alone.notes()
 
     def as_mapping(self) -> dict[str, object]:
         """Return it ready for JSON."""

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from echelon.core.claim import Claim, ClaimKind, Number, Rounding
 from echelon.core.digits import at_least, at_most
 from echelon.core.statement import Hypothesis, Statement, fails, holds
 from echelon.core.types import Array
@@ -15,8 +16,10 @@ from echelon.laws.safety import AXES, Safety
 from echelon.laws.safety_check import hulls_at, separations
 
 _EXACT = (
-    "the model is exact, time is continuous, no input is at a limit and all is known at the same "
-    "instant"
+    "the model is exact",
+    "time is continuous",
+    "no input is at a limit",
+    "all is known at the same instant",
 )
 
 
@@ -55,29 +58,32 @@ class Separation(NamedTuple):
         """The line of a check."""
         name, number = Hypothesis.SEPARATION, (self.least, f"{at_most(self.least)} m at the start")
         if self.ideal:
-            text = f"{at_most(self.safety.distance)} m are kept, scaled, while {_EXACT} (T10)"
+            kept, exact = at_most(self.safety.distance), ", ".join(_EXACT)
+            text = f"{kept} m are kept, scaled, while {exact} (T10)"
             return holds(name, self.kind, text, *number)
-        text = f"observed, not proved: T10 rests on it that {_EXACT}"
+        text = f"observed, not proved: T10 rests on it that {', '.join(_EXACT)}"
         remedy = "allow for the rest by `safety.margin`"
         return fails(name, self.kind, text, *number, remedy=remedy)
 
-    def sentence(self) -> str:
-        """Return what is guaranteed."""
+    def claim(self) -> Claim:
+        """Return what is claimed."""
         radii = " x ".join(at_most(self.safety.size[AXES.index(x)], 4) for x in self.axes)
-        text = f"{self.kind.value}: ellipsoids about the agents with radii of {radii} m never "
-        text += f"overlap from these starts, for any number of agents and any graph, if {_EXACT} "
-        text += "(T10), and each agent stays in its tube (T5). The inputs are held "
-        text += f"for {at_least(self.step)} s, which `safety.margin` has to allow for. "
-        text += "Convergence is not guaranteed "
-        if self.tube.offsets is not None:
-            text += "while offsets change, whose rates are within the `speed` too."
-        else:
-            text += "while agents hold each other back; without that, errors decay at "
-            text += f"{at_most(self.tube.rate)} 1/s or faster eventually."
-        if not self.ideal:
-            text = f"In this world distances are observed, not proved. In the ideal one: {text}"
-        motors = self.tube.motor_load
-        return text if motors is None else f"{text} {motors.sentence()}"
+        tube, changing = self.tube, self.tube.offsets is not None
+        why = "offsets change" if changing else "agents hold each other back"
+        notes = (
+            f"ellipsoids of {radii} m about the agents never overlap",
+            f"inputs are held for {at_least(self.step)} s, which `safety.margin` allows for",
+            f"convergence is not guaranteed while {why}",
+        )
+        numbers = {"kept_distance": Number(self.safety.distance, "m", Rounding.DOWN)}
+        if not changing:
+            numbers["rate_alone"] = Number(tube.rate, "1/s", Rounding.DOWN)
+        if tube.motor_load is not None:
+            numbers |= tube.motor_load.numbers()
+            notes += tube.motor_load.notes()
+        graphs = "any number of agents", "any graph"
+        premises = (*_EXACT, "each agent stays in its tube (T5)")
+        return Claim(ClaimKind.APART, ("these starts",), graphs, premises, numbers, notes)
 
     def as_mapping(self) -> dict[str, object]:
         """Return it ready for JSON."""

@@ -6,6 +6,7 @@ from typing import Any, cast, final
 
 import numpy as np
 
+from echelon.core.claim import Claim
 from echelon.core.statement import Hypothesis, Statement, Topic, holds, unneeded
 from echelon.core.words import Kind
 from echelon.guarantees.messages.late_messages import messages_line
@@ -64,13 +65,13 @@ class StoppingPromise(Guarantee):
         by_name = {cast(Hypothesis, x.statement): x for x in lines}
         against = any(line.fails and line.reason for line in by_name.values())
         tube = None if against else tube
-        separation = separation_of(run, tube, bool(case.disturbed))
+        separation = separation_of(run, tube, bool(case.ignored))
         if separation is not None:
             by_name[Hypothesis.SEPARATION] = separation.line
         return cls(
             loop=case.loop,
             hypotheses=MappingProxyType(by_name),
-            without=case.disturbed,
+            ignores=case.ignored,
             leader_mode=leaders.slowest,
             complete=not brief,
             run=run,
@@ -111,10 +112,10 @@ class StoppingPromise(Guarantee):
         """Return the longest step (s) that keeps the largest stopping point from growing."""
         return self.hold
 
-    def guarantee(self) -> str:
-        """Return what T5 or T10 guarantees."""
+    def claim(self) -> Claim:
+        """Return what T5, T9 or T10 claims."""
         assert self.ground is not None
-        return self.ground.sentence()
+        return self.ground.claim()
 
     def why_covered(self) -> str:
         """Return why a run is covered in which no limit acted."""

@@ -13,6 +13,7 @@ import scipy.sparse.linalg as spla
 
 from echelon.agents.models.model import ControlAffine, in_metres
 from echelon.agents.network.graph import Graph
+from echelon.core.claim import Claim, ClaimKind, Number, Rounding
 from echelon.core.digits import about, at_least, at_most
 from echelon.core.errors import GainError
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
@@ -259,7 +260,7 @@ def _left(roots: Array, starts: Array, times: Array) -> Array:
 
 # ---- the tube ------------------------------------------------------------------------------------
 
-_PROOF = Kind.PROOF
+_PROOF, _UP = Kind.PROOF, Rounding.UP
 
 _ANY = ("any graph in which the leader reaches every agent", "this graph")
 
@@ -288,7 +289,7 @@ class Tube(NamedTuple):
     left: float
     steepest: float
     arrival: float | None
-    who: str
+    who: tuple[str, ...]
     borders: tuple[dict[str, object], ...]
     motor_load: MotorLoad | None
     graphs: tuple[str, str] = _ANY
@@ -301,29 +302,32 @@ class Tube(NamedTuple):
         """T5, and over a network T9."""
         return Theorem.T5 if self.network is None else Theorem.T9
 
-    def sentence(self) -> str:
-        """Return what is promised, in one sentence."""
-        text = f"{self.kind.value}: errors converge to zero from {self.who}, for any number of "
-        text += f"agents and {self.graphs[0]}, if the model is exact and {self._received()}"
-        # Held inputs leave a rest where offsets go on changing.
-        text += ". " if self.offsets is None else "; offsets may change as they do, and inputs of "
-        text += "" if self.offsets is None else "continuous time follow them exactly. "
-        text += f"On {self.graphs[1]} they decay at {at_most(self.rate)} 1/s or faster eventually"
-        if self.network is not None:
-            text += f"{self.network.faster()}. {self.network.sentence(self.arrival)}"
-        elif self.arrival is not None:
-            text += f"; from these starts all stay within 1 cm after {at_least(self.arrival)} s"
-        return f"{text}." if self.motor_load is None else f"{text}. {self.motor_load.sentence()}"
+    def claim(self) -> Claim:
+        """Return what is claimed."""
+        motors, network = self.motor_load, self.network
+        premises = ("the model is exact", *self._received())
+        if self.offsets is not None:
+            # Held inputs leave a rest where offsets go on changing.
+            premises += ("inputs follow offsets that change in continuous time",)
+        numbers = {} if self.arrival is None else {"within_1_cm": Number(self.arrival, "s", _UP)}
+        notes = ()
+        if network is not None:
+            numbers |= network.numbers()
+            notes += network.notes()
+        if motors is not None:
+            numbers |= motors.numbers()
+            notes += motors.notes()
+        graphs = ("any number of agents", self.graphs[0])
+        return Claim(ClaimKind.CONVERGES, self.who, graphs, premises, numbers, notes)
 
-    def _received(self) -> str:
+    def _received(self) -> tuple[str, ...]:
         if self.network is None:
-            return "zeta' is received at all times (T5)"
-        text = "every agent receives one packet of a leader that follows its plan; all messages "
-        text += "after it may be late, lost or out of order"
+            return ("zeta' is received at all times",)
+        silence = ()
         if self.network.leaderward:
             ages = self.network.ages
-            text += f" while no link is silent for {at_most(ages.hop_life * ages.dt)} s"
-        return f"{text} (T9)"
+            silence = (f"no link is silent for {at_most(ages.hop_life * ages.dt)} s",)
+        return ("every agent receives one packet of a leader that follows its plan", *silence)
 
     def as_mapping(self) -> dict[str, object]:
         """Return it ready for JSON."""
@@ -331,7 +335,7 @@ class Tube(NamedTuple):
         finite = {name: None if math.isinf(x) else x for name, x in finite.items()}
         return {
             "format": "echelon tube 1",
-            "who": self.who,
+            "who": list(self.who),
             "gains": list(self.gains),
             **finite,
             "within_1_cm_from": self.arrival,
@@ -484,19 +488,19 @@ def _set_line(run: StoppingRun, border: Border) -> Statement:
     return fails(Hypothesis.SET, _PROOF, text, *number, remedy=remedy, reason=text)
 
 
-def _who(run: StoppingRun, borders: Sequence[Border]) -> str:
+def _who(run: StoppingRun, borders: Sequence[Border]) -> tuple[str, ...]:
     if not borders:
-        return "any state of any agent"
-    within = " and ".join(b.bound.within for b in borders)
+        return ("any state of any agent",)
+    within = [b.bound.within for b in borders]
     free = "any position, heading, sideways speed and turning"
     free = "any position" if any(b.many for b in borders) else free
     if not all(b.led for b in borders):
-        speeds = " and ".join(b.speeds for b in borders)
         # Of the leader's speed against its path no more is used than what these starts ask for.
-        free = f"{free} of the followers, with {within}, their {speeds} as at these starts"
-        return f"{free}, and the leader as at these starts"
-    off = " and ".join(f"{b.speeds} within {at_most(b.steepest)}{_angle(b)}" for b in borders)
-    return f"{free}, with {within}, and {off} of {_whose(borders)}, which keeps to its path there"
+        speeds = [f"their {b.speeds} as at these starts" for b in borders]
+        return (f"{free} of the followers", *within, *speeds, "the leader as at these starts")
+    whose = f"{_whose(borders)}, which keeps to its path there"
+    off = [f"{b.speeds} within {at_most(b.steepest)}{_angle(b)} of {whose}" for b in borders]
+    return (free, *within, *off)
 
 
 def _whose(borders: Sequence[Border]) -> str:

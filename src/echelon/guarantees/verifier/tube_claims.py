@@ -295,9 +295,9 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(40)
 _FINE = Fraction(1, 2**50)
 
 
-def tube_of(promise: JsonObject) -> JsonObject | None:
-    """Return the tube in a stored promise; None if there is none."""
-    tube = promise.get("anywhere")
+def tube_of(stated: JsonObject) -> JsonObject | None:
+    """Return the tube in a stored guarantee; None if there is none."""
+    tube = stated.get("anywhere")
     return tube if isinstance(tube, dict) and tube.get("format") == FORMAT else None
 
 

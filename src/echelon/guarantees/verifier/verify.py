@@ -24,8 +24,8 @@ from echelon.guarantees.verifier.tube_claims import tube_findings, tube_of
 
 # Allowed asymmetry of P after scaling its diagonal to one: rounding of its last digits.
 _SKEW = 1e-12
-PROMISE = "promise."
-"""So begin the claims of a run's guarantee."""
+STATED, CLAIMED = "guarantee", "guarantee."
+"""Where files state the guarantee of a run, and how its claims begin."""
 
 
 class Verification(NamedTuple):
@@ -66,24 +66,24 @@ def verify(path: PathLike, model: ControlAffine | None = None) -> Verification:
         saved = read(document, path)
         note = f" The gain guarantees no decay: the slowest mode is {about(saved.abscissa)} 1/s."
         return judge(_collect(_findings(saved, model)), "" if saved.abscissa < 0.0 else note)
-    return judge(_collect(_promise_findings(document["promise"])))
+    return judge(_collect(_guarantee_findings(document[STATED])))
 
 
 def states_gain(document: JsonObject) -> bool:
     """Return whether a file is to be a gain file, and not one with the guarantee of a run."""
     # A gain first: no key that is added to one may lead to a check of something else.
-    return document.get("format") == FORMAT or "promise" not in document
+    return document.get("format") == FORMAT or STATED not in document
 
 
-def _promise_findings(promise: object) -> Iterator[ClaimCheck]:
-    if not isinstance(promise, dict):
-        yield decide("promise", False, text="it must be a mapping")
+def _guarantee_findings(stated: object) -> Iterator[ClaimCheck]:
+    if not isinstance(stated, dict):
+        yield decide(STATED, False, text="it must be a mapping")
         return
-    tube = tube_of(promise)
+    tube = tube_of(stated)
     if tube is not None:
         yield from tube_findings(tube)
-    for key in promise:
-        yield unchecked(f"{PROMISE}{key}", "", "it follows from the run's scenario alone")
+    for key in stated:
+        yield unchecked(f"{CLAIMED}{key}", "", "it follows from the run's scenario alone")
 
 
 def _collect(checks: Iterator[ClaimCheck]) -> tuple[ClaimCheck, ...]:

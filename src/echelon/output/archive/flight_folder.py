@@ -21,7 +21,7 @@ from echelon.core.numerics import precision
 from echelon.core.trace import shared_traces
 from echelon.core.types import Array, JsonObject
 from echelon.core.words import MessageContent
-from echelon.guarantees.promises.promise import guaranteed
+from echelon.guarantees.promises.promise import guarantee_data
 from echelon.laws.law import Speaks, Travels
 from echelon.output.archive.folder import write_errors
 from echelon.simulation.engine.agent import Agent, OwnLaw
@@ -48,6 +48,8 @@ _EXCLUDES = (
     "supervisor that stops it",
     "other steps than `dt`",
 )
+_STATED = ("verdict", "claim", "theorem", "kind", "start", "premises", "numbers", "ignores")
+"""What law.json repeats of the guarantee of the formation."""
 _CURRENT = "late or lost messages: the guarantee assumes that `z` is of the current step"
 _LATE = "other networks than `network`"
 
@@ -70,18 +72,18 @@ def law_files(parts: Parts, settings: Settings, agent: int, formation: str) -> d
         "law.c": c_text(functions, single.values(), about),
         "law.h": header_text(functions, about, constants | _sizes(double)),
     }
-    sentence = guaranteed(parts, settings)
-    return {**files, "law.json": _facts(own, double, constants, sentence, files)}
+    stated = guarantee_data(parts, settings)
+    return {**files, "law.json": _facts(own, double, constants, stated, files)}
 
 
 def python_law(
-    parts: Parts, settings: Settings, agent: int, formation: str, sentence: str
+    parts: Parts, settings: Settings, agent: int, formation: str, stated: JsonObject
 ) -> dict[str, str]:
-    """Return law.py and law.json of one agent, as `law_files`, with the sentence of `promise`."""
+    """Return law.py and law.json of one agent, as `law_files`, with its guarantee."""
     own, functions = _traced(parts, settings, agent)
     about, constants = _head(settings, agent, formation)
     files = {"law.py": python_text(functions.values(), about, constants)}
-    return {**files, "law.json": _facts(own, functions, constants, sentence, files)}
+    return {**files, "law.json": _facts(own, functions, constants, stated, files)}
 
 
 def _traced(parts: Parts, settings: Settings, agent: int) -> tuple[OwnLaw, dict[str, LawFunction]]:
@@ -104,7 +106,7 @@ def _facts(
     own: OwnLaw,
     functions: Mapping[str, LawFunction],
     constants: Mapping[str, float | str],
-    sentence: str,
+    stated: JsonObject,
     files: Mapping[str, str],
 ) -> str:
     dt = float(constants["DT"])
@@ -114,7 +116,7 @@ def _facts(
         **_description(own, functions),
         "dt": dt,
         "network": network_facts(own, dt, functions),
-        "guaranteed": sentence,
+        "guarantee": {key: stated[key] for key in _STATED},
         "excluded": [*_EXCLUDES, _LATE if isinstance(own.loop.network, LateNetwork) else _CURRENT],
         "echelon": __version__,
         "sha256": {name: hashlib.sha256(text.encode()).hexdigest() for name, text in files.items()},
@@ -209,9 +211,9 @@ def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, 
     """
     network = _network(parts)
     agents, rule = parts.graph.agents, parts.leadership
-    files, sentence = dict[str, str](), guaranteed(parts, settings)
+    files, stated = dict[str, str](), guarantee_data(parts, settings)
     for k in range(agents):
-        law = python_law(parts.replace(leadership=None), settings, k, formation, sentence)
+        law = python_law(parts.replace(leadership=None), settings, k, formation, stated)
         files |= {f"law-{k}/{name}": text for name, text in law.items()}
     facts = json.loads(files["law-0/law.json"])
     vehicles = _vehicles(parts, settings)

@@ -27,13 +27,18 @@ from echelon.experiments.scenario.scenario import (
     load_scenario,
 )
 from echelon.experiments.scenario.self_contained import files_of, names_code, without_folders
-from echelon.experiments.studies.recomputation import compare_structure, experiment_of, recompute
+from echelon.experiments.studies.recomputation import (
+    COVERED,
+    compare_structure,
+    experiment_of,
+    recompute,
+)
 from echelon.guarantees.promises.promise import guarantee
 from echelon.guarantees.verifier import verify as verifier
 from echelon.guarantees.verifier.findings import ClaimCheck, unchecked
 from echelon.guarantees.verifier.saved_gain import read_json
 from echelon.guarantees.verifier.stored_values import Digits, compare_arrays, compare_values
-from echelon.guarantees.verifier.verify import PROMISE, Verification, judge, states_gain
+from echelon.guarantees.verifier.verify import CLAIMED, STATED, Verification, judge, states_gain
 from echelon.output.archive.chunks import Chunks
 from echelon.output.archive.folder import DATA, GAIN, REPORT, SUMMARY, check_exists
 from echelon.output.archive.run_folder import save_run
@@ -47,7 +52,7 @@ OBSERVATIONS = "what the run observed"
 """The claim that stands for all of them where they are not computed again."""
 _COMPUTED = ("engine", "wall_time_s", "versions")
 """Entries of a summary that say how a run was computed, which differs between computers."""
-_ATTRIBUTES = ("computed_by", "solver", "provenance", "promise", "scenario_text", "_NCProperties")
+_ATTRIBUTES = ("computed_by", "solver", "provenance", "guarantee", "scenario_text", "_NCProperties")
 """Attributes that say the same, or are compared by themselves."""
 _PRECISIONS = {"float64": Digits(1e-6, 1e-9), "float32": Digits(1e-3, 1e-4)}
 """To what two processors agree on a run."""
@@ -90,13 +95,18 @@ def claim_files(place: PathLike) -> ClaimFiles:
     if files.claims is None and files.gain is None:
         state = "an unfinished run" if Chunks(path).exist else "no run"
         raise OutputError(f"`{path}` holds {state}: it has neither `{SUMMARY}` nor `{GAIN}`.")
-    stated = {"promise": None} if files.claims is None else read_json(files.claims)
+    stated = {STATED: None} if files.claims is None else read_json(files.claims)
     if files.gain is None and stated.get("gain") is not None:
         raise OutputError(
             f"`{path}` has lost its `{GAIN}`; `echelon run {path} --out OTHER` creates it."
         )
-    if "promise" not in stated:
-        raise OutputError(f"`{files.claims}` is damaged: it has no `promise`.")
+    if STATED not in stated and "promise" in stated:
+        raise OutputError(
+            f"`{files.claims}` was written by an earlier version of echelon; "
+            f"`echelon run {path} --out OTHER` computes it again."
+        )
+    if STATED not in stated:
+        raise OutputError(f"`{files.claims}` is damaged: it has no `{STATED}`.")
     return files
 
 
@@ -177,6 +187,8 @@ def _compare(files: ClaimFiles, data: Labelled, result: Result) -> Iterator[Clai
         stored, value = read_json(files.claims), json.loads(json.dumps(summary(result)))
         theirs, ours = [{k: x[k] for k in names if k in x} for x in (stored, value)]
         yield from compare_values("", theirs, ours, digits)
+        covered = [{COVERED: x[STATED].get(COVERED)} for x in (stored, value)]
+        yield from compare_values(STATED, covered[0], covered[1])
         # What both files say of the program: nothing else says it.
         versions = {k[8:]: x for k, x in data.attributes.items() if k.startswith("version_")}
         value = {"engine": data.attributes.get("computed_by"), "versions": versions}
@@ -333,7 +345,7 @@ def _still_open(
     """Yield what independent code found, without what it left open and the scenario has settled."""
     agree = {each.claim.partition(": ")[2] for each in computed if each.verdict == "recomputed"}
     for each in findings:
-        if each.claim.startswith(PROMISE):
+        if each.claim.startswith(CLAIMED):
             if not computed:
                 yield each._replace(text=obstacle or each.text)
         elif not (each.open and _SETTLED.get(each.claim) in agree):

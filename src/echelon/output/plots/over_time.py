@@ -232,7 +232,7 @@ def formation(run: Recording) -> "Figure":
             draw.plot(ax, times, line, label=name, **pen_of(run, agent))
         _slope(ax, run, errors.max(axis=1, initial=0.0), 1.0)
         if bound is not None:
-            text = f"bound, by {run.promise['kind']} ({run.promise['theorem']})"
+            text = f"bound, by {run.guarantee['kind']} ({run.guarantee['theorem']})"
             draw.plot(ax, times, bound[frames], label=text, color=draw.EDGE, linestyle="-.")
         if run.length_unit:
             ax.axhline(SETTLED, label="1 cm", **draw.MARK)

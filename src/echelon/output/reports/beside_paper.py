@@ -47,14 +47,14 @@ def print_beside_paper(console: "Console", runs: Mapping[str, Result], name: str
     if not known:
         return
     title = f"{name} beside the paper's Table II: RMSE of the first {HORIZON:g} s, m"
-    table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", pad_edge=False)
+    table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", pad_edge=False, padding=0)
+    table.show_edge = False
     width = max(len(f"printed, {method}") for method in PRINTED)
     table.add_column("", no_wrap=True, min_width=width)
     for column in _columns(known[0]):
         table.add_column(column, justify="right", overflow="fold")
     for label, errors in found.items():
         table.add_row(label, *_cells(errors))
-    table.add_section()
     for method, values in PRINTED.items():
         table.add_row(f"printed, {method}", *(f"{value:.4g}" for value in values))
     console.print(table)

@@ -8,10 +8,11 @@ from typing import final
 from echelon.core.statement import Hypothesis, Statement, Topic
 from echelon.core.words import Verdict, amount
 from echelon.experiments.studies.check import CheckResult
+from echelon.output.reports.guarantee_text import WIDTH, guarantee_lines
 from echelon.output.reports.region_report import region_report
 
-WIDTH, HEIGHT = 80, 40
-"""Columns and lines of a terminal."""
+HEIGHT = 40
+"""Lines of a terminal."""
 _PAPERS = {
     *(Topic.AUTONOMOUS, Topic.GRAPH, Topic.GROUNDED, Topic.POSITIVE, Topic.SCHUR, Topic.EDGES),
     *(Topic.MONOTONE, Topic.DRIFT_ALONG_Z, Topic.LMI_AS_PRINTED, Topic.FINITE),
@@ -52,13 +53,14 @@ def check_report(check: CheckResult) -> str:
 
 
 def check_sentences(check: CheckResult) -> list[str]:
-    """Return what is guaranteed, and the warnings."""
-    return [check.promise.sentence(), *(f"Warning: {text}" for text in check.warnings)]
+    """Return the lines of what is guaranteed, and the warnings."""
+    return [*guarantee_lines(check.promise), *(f"Warning: {text}" for text in check.warnings)]
 
 
 def _text(check: CheckResult, detail: _Detail) -> Iterator[str]:
-    for sentence in check_sentences(check):
-        yield from textwrap.wrap(sentence, WIDTH)
+    yield from guarantee_lines(check.promise)
+    for warning in check.warnings:
+        yield from textwrap.wrap(f"Warning: {warning}", WIDTH)
     width = max(len(line.name) for line in check.lines)
     for title, lines in grouped(check.lines).items():
         yield from ("", f"{title}:")

@@ -308,7 +308,7 @@ def _row_mapping(row: ComparisonRow) -> JsonObject:
             for name in ("rmse", "steady_rmse")
         },
         **row.flight.json(Appearance.COMPARISON),
-        "promise": row.flight.promise.as_mapping(),
+        "guarantee": row.flight.promise.as_mapping(),
         "told": list(result.parts.information.follower),
         "solver": None if result.work is None else result.work._asdict(),
     }

@@ -13,7 +13,7 @@ from jaxtyping import Bool
 
 from echelon import __version__
 from echelon.agents.network.hearing import who_hears_whom
-from echelon.core.digits import at_least, at_most
+from echelon.core.digits import at_least
 from echelon.core.errors import Outcome
 from echelon.core.statement import Hypothesis
 from echelon.core.types import JsonObject
@@ -35,6 +35,12 @@ from echelon.experiments.results.table_two import is_of_the_paper
 from echelon.guarantees.promises.coverage import coverage
 from echelon.guarantees.promises.promise import Guarantee, guarantee
 from echelon.output.reports.beside_paper import print_beside_paper, remarks
+from echelon.output.reports.guarantee_text import (
+    UNWRAPPED,
+    WIDTH,
+    guarantee_lines,
+    through_event,
+)
 from echelon.simulation.engine.result import Result
 from echelon.simulation.step.meter import SETTLED
 
@@ -43,6 +49,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 _WIDTH = 100
+_WARNING = "Warning: "
 _CITATION = f"""@software{{echelon,
   title = {{echelon: leader-follower formation tracking for control-affine nonlinear agents}},
   author = {{{{The echelon developers}}}},
@@ -79,12 +86,12 @@ def report(result: Result) -> str:
 
 def whole_report(run: Recording, numbers: str) -> str:
     """Return the numbers of a run, its guarantee with all conditions, and where it is from."""
-    message, promise = str(run.attributes["message"]), run.promise
+    message, stated = str(run.attributes["message"]), run.guarantee
     facts = f"{run.agents} agents, {run.model}; {run.horizon:g} s in steps of {run.dt:g} s"
     versions = {k[8:]: v for k, v in run.attributes.items() if k.startswith("version_")}
     sections = {
-        f"{run.name}: {facts}": numbers.rstrip() or _wrapped(message, promise["sentence"]),
-        "Conditions of the guarantee": _wrapped(*map(_condition, promise["hypotheses"])),
+        f"{run.name}: {facts}": numbers.rstrip() or _known(message, stated),
+        "Conditions of the guarantee": _wrapped(*map(_condition, stated.get("conditions", ()))),
         "Scenario": str(run.attributes.get("scenario_text", "")).rstrip(),
         "Versions": "\n".join(f"{name} {version}" for name, version in versions.items()),
         "Citation": _CITATION,
@@ -98,8 +105,12 @@ def _wrapped(*sentences: str) -> str:
     return "\n".join(map(fill, filter(None, sentences)))
 
 
+def _known(message: str, stated: JsonObject) -> str:
+    return "\n".join([_wrapped(message), *(guarantee_lines(stated) if stated else ())])
+
+
 def _condition(line: JsonObject) -> str:
-    text = f"{line['statement']}: {line['verdict']}"
+    text = f"{line['name']}: {line['verdict']}"
     text += f" ({line['shown']})" if line["shown"] else ""
     text += f"; {line['text']}" if line["text"] else ""
     return text + (f"; to change: {line['remedy']}" if line["remedy"] else "")
@@ -111,14 +122,59 @@ def print_report(console: "Console", result: Result, numbers: Metrics) -> None:
     if printed:
         print_beside_paper(console, {"this run": result}, result.provenance["scenario"])
     console.print(_table(result, numbers))
-    sentences = [*explain(result, numbers), *(f"Warning: {text}" for text in result.warnings)]
+    sentences = [*explain(result, numbers), *(f"{_WARNING}{text}" for text in result.warnings)]
+    print_guarantee(console, guarantee(result.parts, result.settings))
     for sentence in [*sentences, *remarks([result])] if printed else sentences:
+        say(console, sentence)
+
+
+def print_guarantee(console: "Console", stated: Guarantee | JsonObject) -> None:
+    """Print a guarantee, each row on one line where the output is no terminal."""
+    for line in guarantee_lines(stated, _width(console)):
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def _width(console: "Console") -> int:
+    return WIDTH if console.is_terminal else UNWRAPPED
+
+
+OBSERVED = 3
+"""Sentences on what was observed that fit on a screen."""
+
+
+def print_screen(console: "Console", result: Result, numbers: Metrics) -> None:
+    """Print what fits on a screen: tables, outcome, guarantee, and a little of what was observed.
+
+    The whole report, which `echelon report` prints, says the rest.
+    """
+    stated = guarantee(result.parts, result.settings)
+    if is_of_the_paper(result):
+        print_beside_paper(console, {"this run": result}, result.provenance["scenario"])
+    console.print(_table(result, numbers))
+    outcome = list(_outcome(result, numbers, stated))
+    complete = result.outcome is Outcome.COMPLETED and len(outcome) > 1
+    for sentence in outcome[complete:]:
+        say(console, sentence)
+    for line in guarantee_lines(stated, _width(console), brief=True):
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+    seen = (
+        *observations(result, numbers, stated),
+        *coverage(result, stated),
+        *(f"{x.sentence()} {through_event(x.guarantee)}" for x in event_outcomes(result)),
+        *_closest(result, numbers),
+        *_lag(result),
+        *_lyapunov_trend(result, stated),
+    )
+    warnings = [text for text in seen if text.startswith(_WARNING)]
+    others = [text for text in seen if not text.startswith(_WARNING)]
+    told = [*others[:OBSERVED], *warnings, *(f"{_WARNING}{text}" for text in result.warnings)]
+    for sentence in told:
         say(console, sentence)
 
 
 def say(console: "Console", sentence: str) -> None:
     """Print a sentence as an item of a list, on one line where the output is no terminal."""
-    look = "bold red" if sentence.startswith("Warning: ") else None
+    look = "bold red" if sentence.startswith(_WARNING) else None
     wrap = not console.is_terminal
     console.print(f"- {sentence}", style=look, highlight=False, markup=False, soft_wrap=wrap)
 
@@ -139,6 +195,7 @@ def _table(result: Result, numbers: Metrics) -> "Table":
     part = "" if result.outcome.reached else f"{end:g} s of "
     title = f"{name}, {part}{result.settings.horizon:g} s, seed {result.settings.seed}"
     table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", pad_edge=False)
+    table.show_edge = False
     for column in columns:
         table.add_column(column, justify="left" if column == "agent" else "right", no_wrap=True)
     for row in _rows(numbers):
@@ -185,7 +242,7 @@ def explain(result: Result, numbers: Metrics) -> tuple[str, ...]:
     return (
         *_outcome(result, numbers, stated),
         *_closest(result, numbers),
-        *(outcome.sentence() for outcome in event_outcomes(result)),
+        *(f"{x.sentence()} {through_event(x.guarantee)}" for x in event_outcomes(result)),
         *_lag(result),
         *observations(result, numbers, stated),
         *_world(result),
@@ -287,18 +344,6 @@ def _messages(result: Result) -> Iterator[str]:
 
 
 def _guarantee(result: Result, guarantee: Guarantee) -> Iterator[str]:
-    yield guarantee.sentence()
-    slowest, coupling = guarantee.slowest, guarantee.coupling
-    if result.drive.gain is not None and guarantee.governed and slowest is not None:
-        mode = "the slowest mode decays" if slowest < 0.0 else "a mode grows"
-        text = f"{mode} at {at_most(abs(slowest))} 1/s"
-        # Rounding of a mode at 0 is no growth.
-        text = "a mode does not decay" if 0.0 <= slowest < 1e-9 else text
-        text = f"{text} (coupling {coupling:.4g})"
-        # The edge is one of current states and quick actuators.
-        if guarantee.edge is not None and result.world.ideal:
-            text += f". Couplings above {at_least(guarantee.edge, 4)} are sufficient for stability"
-        yield f"Linearized at the trim, {text}."
     yield from coverage(result, guarantee)
     if len(result.graph.leaders) > 1:
         yield f"Leaders: {who_hears_whom(result.graph)}; goals are relative to the nearest leader."
@@ -403,11 +448,12 @@ def beyond(saturated: float, guarantee: Guarantee) -> Iterator[str]:
     `saturated` is the largest fraction of steps in which an agent's input was at a limit.
     """
     # With a theorem, `coverage` says more.
-    acts = guarantee.without or saturated
+    ignored = " and ".join(guarantee.ignores)
+    acts = ignored or saturated
     if not guarantee.promised or guarantee.theorem is not None or not acts:
         return
     text = "The guarantee does not cover this run"
-    text += f": {guarantee.without}" if guarantee.without else ""
+    text += f": {ignored}" if ignored else ""
     limited = f"; inputs were at a limit in {100.0 * saturated:.3g} % of the steps"
     yield f"{text}{limited if saturated else ''}."
 

@@ -3,19 +3,19 @@
 import contextlib
 import dataclasses
 import threading
-from collections.abc import Mapping, Sequence
-from typing import Any, Final, final
+from collections.abc import Sequence
+from typing import Final, final
 
 import numpy as np
 
-from echelon.core.digits import at_most
+from echelon.core.claim import number_in
 from echelon.core.errors import OutputError
-from echelon.core.statement import Hypothesis
 from echelon.core.types import Array, JsonObject
-from echelon.core.words import Verdict
+from echelon.core.words import GuaranteeVerdict
 from echelon.experiments.results.recording import Recording
 from echelon.output.plots.space import Space, body_width, clipped_places, space_of
 from echelon.output.plots.style import raised
+from echelon.output.reports.guarantee_text import OBSERVED, guarantee_text, short_form
 from echelon.output.viewer.charts import charts_of
 from echelon.output.viewer.page import BYTE, COARSE, Group, pack, page
 from echelon_flight.page_server import Handler
@@ -207,66 +207,29 @@ def facts(run: Recording) -> list[str]:
     words = "".join(f" {x.lower()}" if x.isupper() else x for x in run.model)
     texts = [f"{run.agents} agents", words.strip()]
     texts += [f"{leaders} leaders"] if leaders > 1 else []
-    if "coupling" in run.promise and run.promise["coupling"] is not None:
-        texts.append(f"coupling {run.promise['coupling']:.3g}")
+    if run.guarantee and number_in(run.guarantee, "coupling") is not None:
+        texts.append(f"coupling {number_in(run.guarantee, 'coupling'):.3g}")
     return texts
 
 
-def promise_badge(promise: Mapping[str, Any]) -> dict[str, str]:
-    """Return the badge of a promise: its state `holds` or `lost`, a short and a whole text."""
-    if not promise["promised"]:
-        if not promise.get("conditions"):
-            return {"state": "lost", "short": "no guarantee", "whole": promise["sentence"]}
-        short = f"no guarantee: {promise['theorem']} holds while {promise['conditions'][0]}"
-        return {"state": "edge", "short": short, "whole": promise["sentence"]}
-    apart = (promise.get("anywhere") or {}).get("separation")
-    if apart is not None:
-        # In the world of the theorem, or in another.
-        ideal = apart["ideal"]
-        short = f"guaranteed: agents stay apart, {promise['theorem']}"
-        short = short if ideal else "distances observed, not proved"
-        return {"state": "holds" if ideal else "edge", "short": short, "whole": promise["sentence"]}
-    rate, kind = promise["rate"], promise["kind"]
-    source = promise["theorem"] or kind
-    short = f"guaranteed: {f'{at_most(rate)} 1/s' if rate else 'V does not rise'}, {source}"
-    whole = f"{promise['sentence']} {_rate_in_words(promise)}".rstrip()
-    return {"state": "holds", "short": short, "whole": whole}
-
-
-_WIDER = {
-    Hypothesis.SWITCHING: "all graphs of the scenario",
-    Hypothesis.HEADING_FRAME: "all turns of the leader",
-}
-"""What a rate holds for beyond one graph and one heading, by the line that says so."""
-
-
-def _rate_in_words(promise: Mapping[str, Any]) -> str:
-    """Return a sentence on the rate in the badge; empty if the promise's sentence states it."""
-    rate, slowest = promise["rate"], promise.get("slowest_mode")
-    if not rate or promise["theorem"]:
-        return ""
-    if slowest is None or abs(rate + slowest) <= 1e-6 * rate:
-        return f"The rate of {at_most(rate)} 1/s is that of the slowest mode."
-    holding = {
-        x["statement"] for x in promise.get("hypotheses", ()) if x["verdict"] == str(Verdict.HOLDS)
-    }
-    what = " and ".join(text for name, text in _WIDER.items() if name.value in holding)
-    what = what or "inputs that are held over a step"
-    return (
-        f"The rate of {at_most(rate)} 1/s holds for {what}; the slowest mode alone decays at "
-        f"{at_most(-slowest)} 1/s."
-    )
+def guarantee_badge(stated: JsonObject) -> dict[str, str]:
+    """Return the badge of a guarantee: `holds`, `edge` or `lost`, a short and a whole text."""
+    verdict, short = GuaranteeVerdict.named(stated["verdict"]), short_form(stated)
+    observed = verdict is GuaranteeVerdict.GUARANTEED and short == OBSERVED
+    states = {GuaranteeVerdict.GUARANTEED: "holds", GuaranteeVerdict.NONE: "lost"}
+    state = "edge" if observed else states.get(verdict, "edge")
+    return {"state": state, "short": short, "whole": guarantee_text(stated)}
 
 
 def _badge_of_run(run: Recording) -> dict[str, str] | None:
     """None where no guarantee was computed; withdrawn if it does not cover the run."""
-    if not run.promise["sentence"]:
+    if not run.guarantee:
         return None
-    badge, outcome = promise_badge(run.promise), run.attributes.get("outcome")
+    badge, outcome = guarantee_badge(run.guarantee), run.attributes.get("outcome")
     if badge["state"] != "holds" or outcome not in ("left_chart", "diverged"):
         return badge
     short, whole = "the guarantee does not cover this run", badge["whole"]
-    return {"state": "lost", "short": short, "whole": f"{run.attributes['message']} {whole}"}
+    return {"state": "lost", "short": short, "whole": f"{run.attributes['message']}\n{whole}"}
 
 
 # ---- a run that is still being computed --------------------------------------------------------
