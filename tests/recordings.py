@@ -10,15 +10,22 @@ from echelon.experiments.results.dataset import FORMAT
 from echelon.experiments.results.metrics import Avoidance, Ellipsoid
 from echelon.experiments.results.recording import InputBounds, LoopPoles, Recording, TrackingErrors
 
-PROMISE = {
-    "promised": True,
-    "sentence": "Local guarantee (linearization): all is well.",
-    "reasons": [],
+GUARANTEE = {
+    "verdict": "guaranteed",
+    "claim": "converges",
     "theorem": None,
     "kind": "linearization",
-    "rate": 0.5,
-    "coupling": 2.0,
-    "hypotheses": [],
+    "start": ["starts close to the goals"],
+    "graphs": [],
+    "premises": [],
+    "notes": [],
+    "numbers": {
+        "rate": {"value": 0.5, "unit": "1/s", "rounding": "down"},
+        "coupling": {"value": 2.0, "unit": "", "rounding": "nearest"},
+    },
+    "conditions": [],
+    "ignores": [],
+    "covers_start": None,
     "certified_set": None,
 }
 NAMES = ("x", "y", "z", "vx", "vy", "vz", "roll", "pitch", "yaw", "p", "q", "r")
@@ -65,7 +72,7 @@ def recorded(states, inputs, times, offsets, leaders=(0,), names=NAMES, position
         "messages": None,
         "avoidance": None,
         "modes": LoopPoles(np.array([[-1.0 + 2.0j, -1.0 - 2.0j]]), np.array([1.0])),
-        "promise": PROMISE,
+        "guarantee": GUARANTEE,
         "horizon": float(times[-1]),
         "dt": 0.01,
         "attributes": {"outcome": "completed", "message": "The run reached its horizon."}
@@ -151,7 +158,7 @@ def as_file(run):
             "position": " ".join(run.state_names[k] for k in run.position),
             "format": FORMAT,
             "leader_needs": "nothing",
-            "promise": json.dumps(run.promise),
+            "guarantee": json.dumps(run.guarantee),
             "horizon": run.horizon,
             "dt": run.dt,
             "outcome": "completed",

@@ -68,6 +68,7 @@ from .output.plots.run_figures import figures as figures
 from .output.plots.run_figures import save_figures as save_figures
 from .output.plots.video import save_video as save_video
 from .output.reports.comparison_report import comparison_report as comparison_report
+from .output.reports.guarantee_text import guarantee_text as guarantee_text
 from .output.reports.run_report import report as report
 from .simulation import (
     optimal as optimal,

@@ -7,6 +7,7 @@ import networkx as nx
 import numpy as np
 import pytest
 import scipy.linalg
+from in_words import in_words
 from oracles import delayed_abscissa
 
 import echelon as ech
@@ -351,7 +352,7 @@ def test_stopping_points_wait_for_links_and_agree_at_the_rate_of_a_period():
     graph = ech.Graph.switching([(0.0, [(0, 1)]), (0.5, [(1, 2)])], period=1.0)
     parts, settings = stopping(graph, observer=False), ech.Settings(16.0, 0.01)
     found = guarantee(parts, settings)
-    assert found.kind is Kind.PROOF and "in every period" in found.sentence()
+    assert found.kind is Kind.PROOF and "in every period" in in_words(found)
     assert found.hypotheses[Hypothesis.SWITCHING].verdict is Verdict.HOLDS
     size = np.linalg.norm(ech.simulate(parts, settings).errors[:, 1:], axis=(1, 2))
     assert np.log(size[900] / size[1500]) / 6.0 == pytest.approx(found.rate, rel=0.05)

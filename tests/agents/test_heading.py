@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from in_words import in_words
 
 import echelon as ech
 from echelon.agents.models.heading_symmetry import (
@@ -200,7 +201,7 @@ def test_what_is_promised_of_a_turn_is_the_rate_at_which_errors_shrink():
     sizes = np.linalg.norm(run.errors[:, 1:], axis=(1, 2))
     early, late = sizes[[400, 650]]
     assert np.log(late / early) / 5.0 == pytest.approx(line.number, rel=0.02)
-    assert "or to a steady turn at 1 rad/s, at any `yaw`" in found.sentence()
+    assert "or to a steady turn at 1 rad/s, at any `yaw`" in in_words(found)
     assert found.rate == -max(line.number, found.slowest)
 
 
@@ -236,4 +237,4 @@ def test_the_formation_of_yaw_turn_is_held_to_rounding():
     promise = ech.guarantee(parts, settings)
     assert promise.promised and promise.rate > 1.0
     parts, settings = ech.build(ech.load_scenario("yaw-turn", ["follower.frame=world"]))
-    assert "`yaw`" in ech.guarantee(parts, settings).sentence()
+    assert "`yaw`" in in_words(ech.guarantee(parts, settings))

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from in_words import in_words
 
 import echelon as ech
 from echelon.agents.models.model import wrap_angles
@@ -76,7 +77,7 @@ def test_a_ring_that_is_twisted_once_is_outside_of_what_is_guaranteed(make, peri
     result = ech.simulate(parts, chosen)
     # Nobody's neighbours pull more one way than the other.
     assert np.ptp(result.states[-1]) > 0.8 * period
-    assert "everywhere" not in found.sentence()
+    assert "everywhere" not in in_words(found)
     assert found.hypotheses[Hypothesis.STARTS].verdict is Verdict.FAILS
     assert found.kind is (Kind.VERTICES if make is wrapped else Kind.SAMPLES)
     assert found.certified.radius < 0.5 * period

@@ -34,7 +34,9 @@ def test_the_files_state_whom_an_agent_hears_and_run_without_echelon(tmp_path, e
     assert stated["hears"] == list(agent.neighbours) and len(stated["weights"]) == len(
         agent.neighbours
     )
-    assert stated["guaranteed"] == ech.guarantee(parts, settings).sentence()
+    whole = ech.guarantee(parts, settings).as_mapping()
+    assert stated["guarantee"]["verdict"] == "guaranteed"
+    assert {name: whole[name] for name in stated["guarantee"]} == stated["guarantee"]
     for name, digest in stated["sha256"].items():
         assert hashlib.sha256((out / name).read_bytes()).hexdigest() == digest
     x = [0.5] * len(stated["states"])

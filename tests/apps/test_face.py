@@ -182,7 +182,7 @@ def test_the_report_has_numbers_conditions_scenario_versions_and_how_to_cite(ech
 
 def test_the_report_of_a_file_by_itself_has_what_the_file_has(echelon, file, run):
     text = echelon("report", file)[1]
-    assert f"- The run reached its horizon.\n- {run.promise['sentence']}\n" in text
+    assert f"- The run reached its horizon.\n{ech.guarantee_text(run.guarantee)}\n" in text
     assert "Conditions" not in text and "Scenario" not in text and "@software{echelon," in text
 
 

@@ -187,7 +187,7 @@ def weaken(document):
 
 def hide(document):
     weaken(document)
-    document["promise"] = {"anywhere": document.pop("anywhere")}
+    document["guarantee"] = {"anywhere": document.pop("anywhere")}
 
 
 def doubled(folder):
@@ -282,20 +282,22 @@ FORGED = {
     ("tube", REFUSED): {
         "a longer number": in_tube('"agents": 4', '"agents": 4' + "0" * 40),
         # One statement each.
-        "a faster rate": in_summary(lambda d: d["promise"].update(rate=9.0)),
-        "a sentence": in_summary(lambda d: d["promise"].update(sentence="All is well.")),
-        "an arrival": in_summary(lambda d: d["promise"]["anywhere"].update(within_1_cm_from=0.01)),
-        "no tube": in_summary(lambda d: d["promise"].update(anywhere=None)),
-        "another tube": in_summary(lambda d: d["promise"].update(anywhere=3)),
+        "a faster rate": in_summary(lambda d: d["guarantee"]["numbers"]["rate"].update(value=9.0)),
+        "a phrase": in_summary(lambda d: d["guarantee"].update(start=["anywhere"])),
+        "an arrival": in_summary(
+            lambda d: d["guarantee"]["anywhere"].update(within_1_cm_from=0.01)
+        ),
+        "no tube": in_summary(lambda d: d["guarantee"].update(anywhere=None)),
+        "another tube": in_summary(lambda d: d["guarantee"].update(anywhere=3)),
         "another scenario": in_text("scenario.yaml", "agents: 4", "agents: 3"),
-        "the data's promise": in_data(promise=lambda x: x.replace('"rate": ', '"rate": 1')),
+        "the data's guarantee": in_data(guarantee=lambda x: x.replace('"value": ', '"value": 1')),
     },
     # JSON that readers take in different ways.
     ("tube", ILL_FORMED): {
         "a key twice": in_tube('"borders":', '"borders": [1], "borders":'),
         "a tube twice": in_tube('"anywhere":', '"anywhere": {}, "anywhere":'),
-        "NaN": in_tube('"rate": ', '"rate": NaN, "x": '),
-        "Infinity": in_tube('"edge": null', '"edge": -Infinity'),
+        "NaN": in_tube('"dt_s": ', '"dt_s": NaN, "x": '),
+        "Infinity": in_tube('"domain": null', '"domain": -Infinity'),
         "an overflow": in_tube('"edge": null', '"edge": 1e999'),
         "a long number": in_tube('"agents": 4', '"agents": 4' + "0" * 400),
         "deep": in_tube('"edge": null', '"edge": ' + "[" * 10**5),
@@ -378,7 +380,7 @@ def test_what_another_version_made_is_refused_with_a_hint(runs, echelon, here):
     in_summary(lambda d: d["versions"].update(echelon="0.0.1"))(here / "run")
     in_data(version_echelon=lambda _: "0.0.1")(here / "run")
     assert echelon("verify", "run")[0] == 0
-    in_summary(lambda d: d["promise"].update(sentence="Old words."))(here / "run")
+    in_summary(lambda d: d["guarantee"].update(start=["old words"]))(here / "run")
     code, out, _ = echelon("verify", "run")
     told = " ".join(out.split())
     assert code == 1 and "echelon 0.0.1 (" in told and "which may state more, or the same" in told

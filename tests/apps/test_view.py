@@ -25,9 +25,9 @@ from echelon.output.viewer.replay import (
     Growing,
     frames_of,
     growing_page,
+    guarantee_badge,
     header,
     link_shades,
-    promise_badge,
     replay_data,
     replay_page,
 )
@@ -688,28 +688,22 @@ def test_a_notebook_shows_the_replay_in_a_cell_without_a_guarantee(browser, stor
 
 
 def test_the_badge_says_which_rate_it_has_and_is_not_green_over_a_run_that_was_lost(run):
-    told = {"promised": True, "sentence": "Promised.", "theorem": None, "kind": "linearization"}
-    slow = promise_badge(told | {"rate": 0.5, "slowest_mode": -0.5})
-    assert slow["whole"].endswith("0.5 1/s is that of the slowest mode.")
-    both = {"rate": 0.452, "slowest_mode": -1.32}
-    assert "holds for inputs that are held over a step" in promise_badge(told | both)["whole"]
-    lines = [{"statement": "graphs that take turns", "verdict": "holds"}]
-    turns = promise_badge(told | both | {"hypotheses": lines})
-    assert "0.452 1/s holds for all graphs" in turns["whole"]
-    for ideal, state, short in (
-        (True, "holds", "guaranteed: agents stay apart, T10"),
-        (False, "edge", "distances observed, not proved"),
+    told, mode = run.guarantee, {"value": -1.32, "unit": "1/s", "rounding": "up"}
+    assert "rate          0.5 1/s or faster" in guarantee_badge(told)["whole"]
+    both = told | {"numbers": told["numbers"] | {"slowest_mode": mode}}
+    assert "the slowest mode alone decays at 1.32 1/s" in " ".join(
+        guarantee_badge(both)["whole"].split()
+    )
+    for ignores, state, short in (
+        ([], "holds", "guaranteed: agents stay apart, T10"),
+        (["wind or noise acts"], "edge", "distances observed, not proved"),
     ):
-        apart = {"rate": None, "theorem": "T10", "anywhere": {"separation": {"ideal": ideal}}}
-        assert promise_badge(told | apart) | {"whole": ""} == {
-            "state": state,
-            "short": short,
-            "whole": "",
-        }
-    promise = dict(run.promise) | told | {"rate": 0.5, "slowest_mode": -0.5}
+        apart = told | {"claim": "apart", "theorem": "T10", "numbers": {}, "ignores": ignores}
+        badge = guarantee_badge(apart)
+        assert (badge["state"], badge["short"]) == (state, short)
     for outcome, state in (("completed", "holds"), ("left_chart", "lost"), ("diverged", "lost")):
         ended = dict(run.attributes) | {"outcome": outcome, "message": "It ended so."}
-        drawn = dataclasses.replace(run, promise=promise, attributes=ended)
+        drawn = dataclasses.replace(run, attributes=ended)
         assert header(drawn, space_of(run))["promise"]["state"] == state
 
 

@@ -12,6 +12,7 @@ import pytest
 import scipy.integrate
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from in_words import in_words
 
 import echelon as ech
 from echelon.core.digits import at_most
@@ -162,9 +163,9 @@ def test_the_region_is_told_and_the_promise_says_it(robust):
     region = gain.certificate.region
     assert line.verdict is Verdict.HOLDS and line.kind is region.kind is Kind.VERTICES
     assert (line.number, line.number_text) == (region.rate, f"{at_most(region.rate)} 1/s")
-    assert found.promised and "corners of a hull" in found.sentence()
-    assert f"{at_most(region.rate)} 1/s or faster" in found.sentence()
-    assert "(T1)" in found.sentence() and f"<= {at_most(region.radius)}^2" in found.sentence()
+    assert found.promised and "corners of a hull" in in_words(found)
+    assert f"{at_most(region.rate)} 1/s or faster" in in_words(found)
+    assert "(T1)" in in_words(found) and f"<= {at_most(region.radius)}^2" in in_words(found)
     assert (found.theorem, found.kind, found.rate) == (Theorem.T1, Kind.VERTICES, region.rate)
     # No point of the certified set leaves the domain.
     angles = np.linspace(0.0, 2.0 * np.pi, 4001)
@@ -188,13 +189,13 @@ def test_the_leader_s_excursion_is_taken_off_the_margin(robust):
     share = lines["certified set"].number / alone["certified set"].number
     assert share == pytest.approx((0.5 - reach) / 0.5, rel=2e-2)
     assert lines["certified set"].kind is Kind.SAMPLES
-    assert "as in a run of its own" in found.sentence()
+    assert "as in a run of its own" in in_words(found)
     # One that leaves the domain leaves no set.
     lines, found = checked(ROBUST, leader={"law": "passive", "start_error": {"angle": 0.6}})
     line = lines["certified set"]
     assert (line.verdict, line.number_text, line.number) == (Verdict.FAILS, "empty", 0.0)
     assert "the leader alone reaches 0.6 in `angle`, and the domain 0.5" in line.text
-    assert "no start is certified" in found.sentence()
+    assert "no start is certified" in in_words(found)
 
 
 class Yielding(ech.models.Pendulum):
@@ -217,7 +218,7 @@ class Yielding(ech.models.Pendulum):
 def test_the_promise_is_as_strong_as_its_argument(robust, model, method, told, untold):
     gain = ech.synthesize(model, PATH, method)
     lines, found = lines_of(with_gain(robust, gain, model=model))
-    assert found.promised and told in found.sentence() and untold not in found.sentence()
+    assert found.promised and told in in_words(found) and untold not in in_words(found)
     assert not found.hypotheses[Hypothesis.CLAIMS].fails
     if isinstance(model, Yielding):  # why a proof became samples is said
         why = lines["region of the gain"].text.partition("no more than samples, since ")[2]
@@ -238,7 +239,7 @@ def test_what_a_gain_says_of_itself_is_not_believed_but_compared(robust, changes
     assert (found.theorem, found.kind, found.rate) == (true.theorem, true.kind, true.rate)
     told = [key for key in changes if key != "hull"]
     assert found.hypotheses[Hypothesis.CLAIMS].fails is bool(told)
-    assert "Note: the gain says" in found.sentence() and "Note" not in true.sentence()
+    assert "Note: the gain says" in in_words(found) and "Note" not in in_words(true)
 
 
 def test_where_only_the_drift_is_known_the_set_pays_for_the_graph_if_g_varies(robust):
@@ -255,7 +256,7 @@ def test_a_linear_agent_is_certified_everywhere():
     gain = {"method": "contraction", "domain": {}, "rate": 0.2}
     lines, found = checked({"gain": gain}, model=model)
     assert lines["certified set"].number_text == "radius inf"
-    assert "from everywhere" in found.sentence()
+    assert "from everywhere" in in_words(found)
 
 
 def test_a_held_integrator_bears_two_time_constants():
@@ -273,7 +274,7 @@ def test_a_step_too_long_for_the_gain_takes_the_promise_away(share, verdict):
     lines, found = checked(own_gain(1.0), model=SINGLE, simulation={"horizon": 16 * dt, "dt": dt})
     assert lines["step, input held"].verdict is verdict
     assert found.promised is (verdict is Verdict.HOLDS)
-    assert ("is too long for this gain" in found.sentence()) is not found.promised
+    assert ("is too long for this gain" in in_words(found)) is not found.promised
 
 
 def test_followers_that_ignore_each_other_are_promised_what_they_do_alone():
@@ -285,7 +286,7 @@ def test_followers_that_ignore_each_other_are_promised_what_they_do_alone():
         lines, found = checked({"trim": trim}, **quadrotor)
         verdict = lines["Definition 1, f(0) = 0"].verdict
         assert (verdict is Verdict.HOLDS) == found.promised == trim
-        assert ("leaves out the trim input" in found.sentence()) != trim
+        assert ("leaves out the trim input" in in_words(found)) != trim
 
 
 def test_wind_is_left_out_of_the_promise_and_said_to_be():
@@ -295,8 +296,8 @@ def test_wind_is_left_out_of_the_promise_and_said_to_be():
     for sections, words in told:
         lines, found = checked({}, **sections)
         fails = lines["Assumption 3, exact states"].verdict is Verdict.FAILS
-        assert found.promised and fails == ("ignores" in found.sentence()) == bool(words)
-        assert words in found.sentence()
+        assert found.promised and fails == ("ignores" in in_words(found)) == bool(words)
+        assert words in in_words(found)
 
 
 def test_every_failure_says_what_to_change():
@@ -378,7 +379,7 @@ def test_a_gain_file_keeps_its_region_and_is_of_its_model_and_graph_alone(echelo
     assert echelon("design", "mine.yaml", "--method", "robust-lqr", "--out", "gain.json")[0] == 0
     written("file: gain.json", "pendulum")
     code, out, _ = echelon("check", "mine.yaml", "--json")
-    assert code == 0 and json.loads(out) == before and "(T1)" in before["promise"]["sentence"]
+    assert code == 0 and json.loads(out) == before and "(T1)" in before["guarantee"]["sentence"]
     for agents, model, sentence in (
         (5, "pendulum", "made for a graph of 3 agents"),
         (3, "van-der-pol", "was made for `Pendulum` with state_names"),

@@ -136,7 +136,8 @@ def test_the_scenario_s_own_law_is_always_a_row(changes, labels):
     for row in found.rows:
         result = row.flight.result
         assert (
-            told[row.label]["promise"] == ech.guarantee(result.parts, result.settings).as_mapping()
+            told[row.label]["guarantee"]
+            == ech.guarantee(result.parts, result.settings).as_mapping()
         )
 
 

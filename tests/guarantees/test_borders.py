@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
+from in_words import in_words
 
 import echelon as ech
 from echelon.agents.models.chains import chains_of
@@ -85,13 +86,13 @@ def test_a_unicycle_is_promised_while_it_drives(tmp_path):
     assert found.promised and found.theorem is Theorem.T5 and found.kind is Kind.PROOF
     [border] = found.tube.borders
     # A chord of the leader's speed is 60 degrees; its path is enclosed a little below 1.4 m/s.
-    assert 1.36 < border["path"] <= 1.4 and "a speed above 0" in found.sentence()
+    assert 1.36 < border["path"] <= 1.4 and "a speed above 0" in in_words(found)
     chord = 2.0 * np.degrees(np.arcsin(found.tube.steepest / 2.8))
-    assert 57.0 < chord < 60.0 and f"{at_most(chord)} deg to either side" in found.sentence()
+    assert 57.0 < chord < 60.0 and f"{at_most(chord)} deg to either side" in in_words(found)
     file, told = tmp_path / "summary.json", found.as_mapping()
 
     def verdict():
-        file.write_text(json.dumps({"promise": told}))
+        file.write_text(json.dumps({"guarantee": told}))
         return verify(file).verdict
 
     assert verdict() == "incomplete"
@@ -111,7 +112,7 @@ def test_a_unicycle_that_might_stop_is_told_what_would_help():
         ({"speed": 1.2}, lower),
     ):
         found = promised(driven(**change))
-        assert not found.promised and text in found.sentence()
+        assert not found.promised and text in in_words(found)
     # Where the path stands still it has no direction.
     with pytest.raises(EchelonError, match="`x'`, `y'` are 0 there, and allowed is a speed above"):
         prepare(driven(reference=ech.references.Hover()), ech.Settings(horizon=1.0, dt=0.01))
@@ -130,15 +131,15 @@ def test_of_a_leader_off_its_path_no_other_place_is_meant():
     # At most c |zeta - path| of its speed is used here, which grows from another place.
     found = led(place=(0.0, 0.02), speed=5.0)
     assert found.promised
-    assert "from any position of the followers, with a speed above 0" in found.sentence()
-    assert "and the leader as at these starts" in found.sentence()
-    assert "any position," in led().sentence() and "keeps to its path" in led().sentence()
+    assert "from any position of the followers, with a speed above 0" in in_words(found)
+    assert "and the leader as at these starts" in in_words(found)
+    assert "any position," in in_words(led()) and "keeps to its path" in in_words(led())
     # One that is turned, with its stopping point on the path: y' / root away from where it is.
     turn, speed = 0.5, 1.4
     ways = np.array([[np.cos(a), np.sin(a)] for a in (np.pi / 2, np.pi / 2 + turn)])
     found = led(place=-speed * (ways[1] - ways[0]) / 4.0, turned=turn)
-    assert found.promised and "keeps to its path" not in found.sentence()
-    assert "and the leader as at these starts" in found.sentence()
+    assert found.promised and "keeps to its path" not in in_words(found)
+    assert "and the leader as at these starts" in in_words(found)
 
 
 @pytest.mark.slow
@@ -220,13 +221,13 @@ def swings(model):
 def test_what_is_proved_of_a_model_of_ones_own_is_promised_and_flown():
     found = promised(swings(Swing()))
     assert found.promised and found.kind is Kind.PROOF
-    assert "any state of any agent" in found.sentence()
+    assert "any state of any agent" in in_words(found)
     result = ech.simulate(swings(Swing()), ech.Settings(horizon=8.0, dt=0.01))
     assert np.abs(result.errors[-1]).max() <= 1e-9
     # One that ends somewhere unknown is promised nothing.
     found = promised(swings(Tilted()))
     assert not found.promised
-    assert "does not state where its flat coordinates end" in found.sentence()
+    assert "does not state where its flat coordinates end" in in_words(found)
 
 
 STATED = {"flat_chains": FlatChains((2,), (0,)), "flat_bounds": ()}

@@ -4,11 +4,12 @@ import json
 
 import numpy as np
 import pytest
+from in_words import in_words
 
 import echelon as ech
 from echelon.core.statement import Hypothesis
 from echelon.core.words import GuaranteeVerdict
-from echelon.output.viewer.replay import promise_badge
+from echelon.output.viewer.replay import guarantee_badge
 
 GRAPH = ech.Graph.path(3)
 SETTINGS = ech.Settings(horizon=4.0, dt=0.01)
@@ -50,15 +51,14 @@ def test_a_limit_leaves_a_claim_to_the_run():
     told = found.as_mapping()
     assert found.verdict is GuaranteeVerdict.CONDITIONAL and not found.promised and found.claimed
     assert str(found.theorem) == kind == told["theorem"]
-    assert told["verdict"] == "conditional" and told["promised"] is False
-    assert told["conditions"] == [WHILE]
-    assert found.sentence().startswith(f"Not guaranteed: this holds while {WHILE}.")
+    assert told["verdict"] == "conditional" and found.conditions == (WHILE,)
+    assert in_words(found).startswith(f"Conditional (exact proof, T5) while {WHILE} ")
     assert found.hypotheses[Hypothesis.LIMITS].fails
     # The run that meets its limits, and misses, is not covered; the one that never does is.
     for model, covered in ((weak, False), (strong, True)):
         result = ech.simulate(parts_of(model, kind), SETTINGS)
         assert bool(result.saturated.max() == 0.0) is covered
-        assert ech.summary(result)["covered"] is covered
+        assert ech.summary(result)["guarantee"]["covered"] is covered
         what = "proof" if covered else "conditional claim"
         says = "covers this run" if covered else "does not cover this run: a limit acted"
         assert f"The {what} {says}" in " ".join(str(ech.report(result)).split())
@@ -74,8 +74,8 @@ def test_a_claim_is_guaranteed_without_limits_of_the_model_and_of_every_plant(ki
         (parts_of(weak, kind), SETTINGS._replace(limits=False)),
     ):
         found = ech.guarantee(parts, settings)
-        assert found.verdict is GuaranteeVerdict.GUARANTEED and found.promised, found.sentence()
-        assert found.sentence().startswith(("Proved", "Local guarantee"))
+        assert found.verdict is GuaranteeVerdict.GUARANTEED and found.promised, in_words(found)
+        assert in_words(found).startswith("Guaranteed (")
     for world in (ech.World(plant=weak), ech.World(plants={2: weak})):
         found = ech.guarantee(parts_of(wide, kind, world=world), SETTINGS)
         # T1 is about agents that move as the model says; near the goals no limit acts.
@@ -90,18 +90,18 @@ def test_only_the_leader_at_its_limit_leaves_a_run_uncovered():
     parts = parts.replace(drive=ech.Laws(leader, parts.drive.follower))
     result = ech.simulate(parts, SETTINGS)
     assert result.saturated[0] > 0.0
-    assert ech.summary(result)["covered"] is False
+    assert ech.summary(result)["guarantee"]["covered"] is False
 
 
 @pytest.mark.slow
 def test_the_badge_says_what_is_conditional_and_what_is_none():
     found = ech.guarantee(*ech.build(ech.load_scenario("crossing")))
     assert found.verdict is GuaranteeVerdict.CONDITIONAL and str(found.theorem) == "T10"
-    badge = promise_badge(found.as_mapping())
+    badge = guarantee_badge(found.as_mapping())
     assert badge["state"] == "edge" and WHILE in badge["short"]
     found = ech.guarantee(*ech.build(ech.load_scenario("leader-lost")))
     assert found.verdict is GuaranteeVerdict.NONE and found.conditions == ()
-    assert promise_badge(found.as_mapping())["short"] == "no guarantee"
+    assert guarantee_badge(found.as_mapping())["short"] == "no guarantee"
 
 
 WEAK = "plant={agents: {2: {parameters: {motor_thrust: 0.06}}}}"
@@ -118,8 +118,8 @@ WEAK = "plant={agents: {2: {parameters: {motor_thrust: 0.06}}}}"
 )
 def test_motors_that_cannot_give_what_the_trim_needs_leave_nothing_guaranteed(change, said):
     found = ech.guarantee(*ech.build(ech.load_scenario("paper", [change])))
-    assert found.promised is (said == "") and said in found.sentence()
-    assert ("more than the trim" in found.sentence()) == ("0.07" in change)
+    assert found.promised is (said == "") and said in in_words(found)
+    assert ("more than the trim" in in_words(found)) == ("0.07" in change)
 
 
 def test_a_domain_that_was_seen_at_stored_frames_alone_covers_no_run_from_outside_the_set():
@@ -129,7 +129,7 @@ def test_a_domain_that_was_seen_at_stored_frames_alone_covers_no_run_from_outsid
     assert ech.guarantee(parts, SETTINGS).hypotheses[Hypothesis.STARTS].fails
     for every, covered in ((1, True), (5, None)):
         result = ech.simulate(parts, SETTINGS._replace(store_every=every))
-        assert ech.summary(result)["covered"] is covered
+        assert ech.summary(result)["guarantee"]["covered"] is covered
 
 
 SCENARIO = f"""
@@ -150,13 +150,13 @@ def test_check_run_sweep_verify_and_json_agree(echelon, tmp_path):
     code, out, _ = echelon("check", "carts.yaml")
     assert code == 1 and f"while {WHILE}" in " ".join(out.split())
     code, out, _ = echelon("check", "carts.yaml", "--json")
-    assert code == 1 and json.loads(out)["promise"]["verdict"] == "conditional"
+    assert code == 1 and json.loads(out)["guarantee"]["verdict"] == "conditional"
     code, out, _ = echelon("run", "carts.yaml", "--no-figures", "--out", "o")
     assert code == 0 and "does not cover this run" in " ".join(out.split())
     told = json.loads((tmp_path / "o" / "summary.json").read_text())
-    assert told["promise"]["verdict"] == "conditional" and told["covered"] is False
+    assert told["guarantee"]["verdict"] == "conditional" and told["guarantee"]["covered"] is False
     assert echelon("verify", "o", "--scenario", "o")[0] == 0
-    told["promise"]["verdict"], told["promise"]["promised"] = "guaranteed", True
+    told["guarantee"]["verdict"] = "guaranteed"
     (tmp_path / "o" / "summary.json").write_text(json.dumps(told))
     assert echelon("verify", "o", "--scenario", "o")[0] == 1
     over = ("--over", "model.parameters.most=0.05,1000")

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from in_words import in_words
 
 import echelon as ech
 from echelon.agents.models.chains import chains_of
@@ -105,7 +106,7 @@ def test_what_fits_the_equations_is_a_guarantee_of_samples_and_else_none(model, 
 def test_a_guarantee_says_that_it_rests_on_what_a_class_states():
     found = promised(Slower())
     assert found.promised and found.theorem is Theorem.T5 and found.kind is Kind.SAMPLES
-    assert found.sentence().startswith("Seen at samples, which is no proof: ")
+    assert in_words(found).startswith("Seen at samples, which is no proof: ")
     for line in (found.hypotheses[name] for name in (Hypothesis.SET, Hypothesis.STARTS)):
         assert line.kind is Kind.SAMPLES
         assert "if its borders are those that `Slower` states" in line.text

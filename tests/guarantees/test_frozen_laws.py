@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from in_words import in_words
 
 import echelon as ech
 from echelon.core.statement import Hypothesis
@@ -25,7 +26,7 @@ def test_a_yaw_that_loses_the_formation_is_not_promised_unless_the_law_turns(yaw
     found = ech.guarantee(*built("paper", f"reference.yaw={yaw}", "follower.frame=world"))
     line = line_of(found)
     assert not found.promised and line.fails and line.kind is Kind.SAMPLES
-    assert line.number > 0.1 and f"`yaw` {yaw:.3g} rad" in found.sentence()
+    assert line.number > 0.1 and f"`yaw` {yaw:.3g} rad" in in_words(found)
     assert "`yaw`" in line.remedy
 
 

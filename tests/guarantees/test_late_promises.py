@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
+from in_words import in_words
 
 import echelon as ech
 from echelon.agents.world.sensing import Sensing
@@ -67,7 +68,7 @@ def test_a_flight_over_a_radio_keeps_what_is_guaranteed(hears, options):
     parts = parts_of(dataclasses.replace(RADIO, hears=hears), **options)
     settings = SETTINGS._replace(horizon=16.0)
     guarantee = said(parts, settings)
-    assert guarantee.promised and guarantee.theorem is Theorem.T9 and not guarantee.without
+    assert guarantee.promised and guarantee.theorem is Theorem.T9 and not guarantee.ignores
     numbers, arrival = over(guarantee), guarantee.tube.arrival
     result = ech.simulate(parts, settings)
     away = np.abs(stops(result, guarantee))
@@ -118,9 +119,9 @@ def test_drawn_networks_keep_what_is_guaranteed(seed):
 
 @pytest.mark.slow
 def test_the_network_is_no_longer_ignored_but_what_else_is_there_is():
-    assert "ignores" not in said(parts_of()).sentence()
+    assert "ignores" not in in_words(said(parts_of()))
     wind = {"disturbance": ech.Disturbance(constant={"velocity": 0.1})}
-    text = said(parts_of(world=wind)).sentence()
+    text = in_words(said(parts_of(world=wind)))
     assert (
         "ignores that wind or noise acts" in text and "late or lost" not in text.split("ignores")[1]
     )
@@ -141,7 +142,7 @@ LINKS = [(0, 1, 0.3), (1, 2, 0.3)]
 def test_what_no_formation_survives_has_no_guarantee(change, options, words):
     guarantee = said(parts_of(dataclasses.replace(RADIO, **change), **options))
     assert not guarantee.promised and guarantee.anywhere() is None
-    assert words in guarantee.sentence() and guarantee.hypotheses[Hypothesis.MESSAGES].fails
+    assert words in in_words(guarantee) and guarantee.hypotheses[Hypothesis.MESSAGES].fails
 
 
 def test_in_a_run_too_short_for_a_first_packet_nobody_is_said_to_arrive():
@@ -171,7 +172,7 @@ def test_leaders_that_start_apart_and_graphs_that_switch_are_not_covered():
     switching = parts_of().replace(graph=ech.Graph.switching(rows, period=2.0))
     for parts, words in ((apart, "leaders start apart"), (switching, "switches")):
         guarantee = said(parts)
-        assert words in guarantee.sentence() and "late or lost" in guarantee.without
+        assert words in in_words(guarantee) and "late or lost" in guarantee.ignores
 
 
 def test_the_ideal_network_has_no_line_of_it_and_a_leader_that_stays_needs_no_plan():
@@ -210,7 +211,7 @@ def test_a_border_is_not_passed_before_the_first_packet():
     assert said(parts).promised
     radio = said(parts.replace(world=ech.World(network=RADIO)))
     # Without a packet a unicycle stops, where its heading is not known.
-    assert not radio.promised and "before their first packet" in radio.sentence()
+    assert not radio.promised and "before their first packet" in in_words(radio)
 
 
 def delayed_radius(c, root, dt, delay):
@@ -310,7 +311,7 @@ def test_beyond_the_margin_a_run_swings_and_is_warned_of():
         guarantee, result = said(parts), ech.simulate(parts, SETTINGS)
         swung = np.abs(stops(result, guarantee)[-200:]).max()
         assert (swung > 0.1) == (more > 0)
-        assert ("the linearized loop does not decay" in guarantee.sentence()) == (more > 0)
+        assert ("the linearized loop does not decay" in in_words(guarantee)) == (more > 0)
 
 
 @pytest.mark.slow
@@ -324,7 +325,7 @@ def test_no_forged_number_of_a_network_is_verified(echelon, tmp_path):
     assert verdict("--scenario", "paper-radio") == 0
     # Without its scenario nothing of a network can be computed again.
     assert verdict() == 5
-    numbers = stored["promise"]["anywhere"]["network"]
+    numbers = stored["guarantee"]["anywhere"]["network"]
     for key, value in numbers.items():
         numbers[key] = 1.001 * value if isinstance(value, float) else "T5"
         assert verdict("--scenario", "paper-radio") == 1, key

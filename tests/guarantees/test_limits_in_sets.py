@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
+from in_words import in_words
 
 import echelon as ech
 from echelon.core.statement import Hypothesis
@@ -46,7 +47,7 @@ def test_no_input_passes_its_limit_from_the_border_of_the_set(directed):
     model, graph = Cart(dimension=2), ech.Graph.path(4, directed=directed)
     parts, gain = parts_of(model, graph)
     found = ech.guarantee(parts, SETTINGS)
-    assert found.verdict is GuaranteeVerdict.GUARANTEED, found.sentence()
+    assert found.verdict is GuaranteeVerdict.GUARANTEED, in_words(found)
     radius = found.certified.radius
     assert not found.hypotheses[Hypothesis.LIMITS].fails and 0.0 < radius < np.inf
     # The worst start of one follower's input, by hand: delta = r Omega^-1 a / |a|.

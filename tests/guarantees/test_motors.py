@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import scipy.integrate
 import scipy.linalg
+from in_words import in_words
 
 import echelon as ech
 from echelon.core.enclosure.taylor import enclose_derivatives
@@ -160,7 +161,7 @@ def test_a_brief_promise_is_the_same_but_for_arrival(hovering):
     [brief] = promises(parts.replace(), [settings], brief=True)
     assert whole.tube.motor_load is not None and whole.tube.arrival is not None
     assert brief.tube == whole.tube._replace(arrival=None)
-    assert "thrust" in brief.sentence() and "within 1 cm" not in brief.sentence()
+    assert "thrust" in in_words(brief) and "within 1 cm" not in in_words(brief)
     for name in ("promised", "reasons", "kind", "theorem", "rate", "hold", "certified"):
         assert getattr(brief, name) == getattr(whole, name), name
     assert dict(brief.hypotheses) == dict(whole.hypotheses)
@@ -172,12 +173,12 @@ def test_motors_that_suffice_are_promised_and_verified(hovering, tmp_path):
     assert line.verdict is Verdict.HOLDS and line.kind is Kind.PROOF
     assert found.promised and not found.conditions
     assert 0.0 < load.least < QUADROTOR.mass * QUADROTOR.gravity / 4.0 < load.largest < 0.15975
-    assert "thrust stays between" in found.sentence() and load.alone.rest
+    assert "thrust stays between" in in_words(found) and load.alone.rest
     told = found.as_mapping()
     file = tmp_path / "summary.json"
 
     def check():
-        file.write_text(json.dumps({"promise": told}))
+        file.write_text(json.dumps({"guarantee": told}))
         return verify(file)
 
     # What is no part of a tube needs the scenario.
@@ -205,7 +206,7 @@ def test_motors_that_may_not_suffice_leave_the_tube_to_the_run(hovering):
     law = eqx.tree_at(lambda law: law.speed, parts.drive.follower, (4.0, 4.0, 0.7, 0.3))
     found = guarantee(parts.replace(drive=parts.drive.with_follower(law)), settings)
     assert found.tube is not None and found.tube.motor_load is None
-    assert found.claimed and not found.promised and "while no input" in found.sentence()
+    assert found.claimed and not found.promised and "while no input" in in_words(found)
     line = found.hypotheses[Hypothesis.LIMITS]
     assert line.fails and "gentler `roots`" in line.remedy
     free = guarantee(parts, settings._replace(limits=False))
@@ -214,7 +215,7 @@ def test_motors_that_may_not_suffice_leave_the_tube_to_the_run(hovering):
     weaker = dataclasses.replace(QUADROTOR, motor_thrust=0.08)
     for world in (ech.World(plants={1: weaker}), ech.World(actuator=ech.Actuator(minimum=0.06))):
         other = guarantee(parts.replace(world=world), settings)
-        assert other.claimed and not other.promised and "while no input" in other.sentence()
+        assert other.claimed and not other.promised and "while no input" in in_words(other)
 
 
 @pytest.mark.slow

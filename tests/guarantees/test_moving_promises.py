@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from in_words import in_words
 
 import echelon as ech
 from echelon.agents.network.formation_motion import OffsetMotion, Reshape, Rotate, Scale
@@ -67,12 +68,12 @@ def test_bounds_of_offsets_hold_at_all_times_and_are_not_far_above():
 def test_a_motion_is_guaranteed_with_what_it_asks_of_the_chart():
     still, moving = (guarantee(parts(x), SETTINGS) for x in ([], CHANGES))
     assert moving.claimed and moving.rate == still.rate
-    assert "offsets may change as they do" in moving.sentence()
+    assert "offsets may change as they do" in in_words(moving)
     assert "offsets" in moving.anywhere() and "offsets" not in still.anywhere()
     # Offsets that rise and fall use up a part of the thrust.
     size = float(offset_sizes(parts(CHANGES).formation.motion)[2][2])
     assert still.tube.left - moving.tube.left == pytest.approx(size, rel=1e-9)
-    assert "that of the own offset and the leader's" in moving.sentence()
+    assert "that of the own offset and the leader's" in in_words(moving)
 
 
 @pytest.mark.slow
@@ -96,7 +97,7 @@ def test_agents_stay_within_the_tube_of_a_moving_formation():
 def test_no_bound_of_a_user_s_motion_leaves_agents_with_borders_unguaranteed():
     value = guarantee(parts([Wave()]), SETTINGS)
     assert not value.promised
-    assert "no bound of the motion `Wave` is known" in value.sentence()
+    assert "no bound of the motion `Wave` is known" in in_words(value)
     carts = guarantee(parts([Wave()], ech.models.DoubleIntegrator(3)), SETTINGS)
     assert carts.promised
 
@@ -109,7 +110,7 @@ def test_a_law_of_states_is_not_guaranteed():
     assert guarantee(still, SETTINGS).promised
     value = guarantee(moving, SETTINGS)
     assert not value.promised and value.hypotheses[Hypothesis.SYMMETRY].fails
-    assert "offsets change with time" in value.sentence()
+    assert "offsets change with time" in in_words(value)
 
 
 @pytest.mark.slow
@@ -117,8 +118,8 @@ def test_safety_keeps_the_tube_of_the_speed_and_promises_no_convergence():
     apart = ech.laws.StoppingPoint(safety=ech.Safety(radii=(0.1, 0.1, 0.3)))
     still, moving = (guarantee(parts(x, follower=apart), SETTINGS) for x in ([], [Rotate(0.5)]))
     assert moving.tube.left == still.tube.left and moving.rate is None
-    assert "not guaranteed while offsets change" in moving.sentence()
-    assert "decay at" not in moving.sentence()
+    assert "not guaranteed while offsets change" in in_words(moving)
+    assert "decay at" not in in_words(moving)
 
 
 FORGERIES = {
@@ -131,13 +132,15 @@ FORGERIES = {
 
 
 def test_claims_of_offsets_are_checked_by_code_of_its_own(tmp_path):
-    document = json.loads(json.dumps({"promise": guarantee(parts(CHANGES), SETTINGS).as_mapping()}))
+    document = json.loads(
+        json.dumps({"guarantee": guarantee(parts(CHANGES), SETTINGS).as_mapping()})
+    )
     file = tmp_path / "summary.json"
     file.write_text(json.dumps(document))
     assert verify(file).verdict == "incomplete", verify(file).sentence
     for name, forge in FORGERIES.items():
         forged = copy.deepcopy(document)
-        forge(forged["promise"]["anywhere"]["offsets"])
+        forge(forged["guarantee"]["anywhere"]["offsets"])
         file.write_text(json.dumps(forged))
         assert verify(file).verdict == "refused", name
 

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from in_words import in_words
 
 import echelon as ech
 from echelon.agents.network.formation_motion import OffsetMotion, Reshape, Rotate
@@ -70,7 +71,7 @@ def test_a_motion_that_is_not_shown_smooth_is_not_guaranteed(changes, horizon):
     parts, value = guaranteed(*changes, horizon=horizon)
     assert not value.promised
     name = type(changes[-1]).__name__
-    assert f"the motion `{name}` is not known to have 2 bounded derivatives" in value.sentence()
+    assert f"the motion `{name}` is not known to have 2 bounded derivatives" in in_words(value)
     if isinstance(changes[0], Rotate):  # nor was it true: errors jump with it
         run = ech.simulate(parts, ech.Settings(horizon=10.0, dt=0.01))
         assert run.formation_errors[run.times > 4.0].max() > 0.4

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from in_words import in_words
 
 import echelon as ech
 from echelon.agents.models.chains import chains_of
@@ -183,7 +184,7 @@ def test_behind_a_rough_path_nothing_is_guaranteed(name):
     found = guarantee(parts, ech.Settings(horizon=10.0, dt=0.01))
     assert found.promised == (name == "sine")
     if not found.promised:
-        assert "`Along` is not known to have 2 bounded derivatives" in found.sentence()
+        assert "`Along` is not known to have 2 bounded derivatives" in in_words(found)
 
 
 def test_a_branch_is_left_between_two_intervals_by_neither():

@@ -9,9 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from in_words import in_words
 
 import echelon as ech
 from echelon.core import statement
+from echelon.core.claim import Claim, ClaimKind
 from echelon.core.digits import at_most
 from echelon.core.identity import digest
 from echelon.core.statement import Hypothesis
@@ -53,20 +55,20 @@ def changes(scenario, method, feedforward):
 
 def core(told):
     """Theorem, kind, rate and verdicts of a promise told as JSON."""
-    verdicts = {each["statement"]: each["verdict"] for each in told["hypotheses"]}
-    return told["promised"], told["theorem"], told["kind"], told["rate"], verdicts
+    verdicts = {each["name"]: each["verdict"] for each in told["conditions"]}
+    return told["verdict"], told["theorem"], told["kind"], told["numbers"].get("rate"), verdicts
 
 
 def tellers(scenario, built, method):
     """What everyone tells of a scenario, by who tells it, each as JSON."""
     result = ech.simulate(*built)
-    assert ech.guarantee(*built).sentence() in " ".join(ech.report(result).split())
+    assert in_words(ech.guarantee(*built)) in " ".join(ech.report(result).split())
     (design,) = ech.design(scenario, method).designs
     (row,) = ech.compare(scenario, built, ("own",)).rows
     return {
         "check": ech.check(*built).promise.as_mapping(),
-        "summary": json.loads(json.dumps(ech.summary(result)))["promise"],
-        "dataset": json.loads(ech.dataset(result).attrs["promise"]),
+        "summary": json.loads(json.dumps(ech.summary(result)))["guarantee"],
+        "dataset": json.loads(ech.dataset(result).attrs["guarantee"]),
         "design": design.promise.as_mapping(),
         "compare": row.flight.promise.as_mapping(),
     }
@@ -168,12 +170,12 @@ def test_a_gain_of_another_graph_or_coupling_is_promised_what_it_does():
     assert found.loop.slowest == pytest.approx(slowest, rel=1e-6)
     low = path.spectrum().low
     assert found.edge == pytest.approx(0.5 / low, rel=1e-9)
-    note = f"Note: the gain was made for lambda_min 1, and this graph has {low:.4g}"
-    assert note in found.sentence()
+    note = f"note the gain was made for lambda_min 1, and this graph has {low:.4g}"
+    assert note in in_words(found)
     report = " ".join(ech.report(ech.simulate(parts, settings(horizon=0.02))).split())
-    assert found.sentence() in report
+    assert in_words(found) in report
     assert found.slowest == pytest.approx(slowest, rel=0.01)
-    assert f"slowest mode decays at {at_most(-found.slowest)} 1/s" in report
+    assert f"rate {at_most(-found.slowest)} 1/s or faster" in report
     # An edited coupling, too weak for a model that grows.
     model = ech.models.Linear(A=[[0.0, 1.0], [1.0, 0.0]], B=[[0.0], [1.0]])
     gain = ech.synthesize(model, PATH, ech.gains.Riccati())
@@ -182,7 +184,7 @@ def test_a_gain_of_another_graph_or_coupling_is_promised_what_it_does():
     slowest = true_slowest(model, PATH, weak)
     assert gain.certificate.stable and slowest > 0.0 and not found.promised
     assert found.loop.slowest == pytest.approx(slowest, rel=1e-9)
-    assert "and this model at coupling 0.2 has" in found.sentence()
+    assert "and this model at coupling 0.2 has" in in_words(found)
 
 
 def test_one_step_of_the_integrator_that_runs_decides():
@@ -223,7 +225,7 @@ def test_vehicles_that_cannot_hold_their_trim_are_promised_nothing(change):
     told = "the actuators deliver `thrust` 0.2 of 0.2747 N, and cannot hold the trim"
     report = " ".join(ech.report(ech.simulate(*built)).split())
     assert not found.promised and not designs.recommended.promise.promised
-    assert told in found.sentence() and told in designs.because and told in report
+    assert told in in_words(found) and told in designs.because and told in report
     assert found.hypotheses[Hypothesis.TRIM_WITHIN_LIMITS].number == pytest.approx(0.728, abs=1e-3)
     assert ech.guarantee(built.parts, built.settings._replace(limits=False)).promised
 
@@ -240,7 +242,7 @@ def test_leaders_that_disagree_leave_no_proof_and_containment_is_said():
     assert not found.promised and found.theorem is None and found.region is None
     line = found.hypotheses[Hypothesis.LEADERS_AGREE]
     assert line.fails and line.number == pytest.approx(1.0)
-    assert "end in the leaders' convex hull" in found.sentence()
+    assert "end in the leaders' convex hull" in in_words(found)
     # They do: the followers stand between the leaders, and off their goals for good.
     last = ech.simulate(apart, settings(horizon=20.0)).states[-1, :, 0]
     assert last[1:3] == pytest.approx([1 / 3, 2 / 3], abs=1e-3)
@@ -301,7 +303,7 @@ def test_only_a_law_that_keeps_the_theorem_is_promised_it():
     errors = ech.simulate(parts, settings(horizon=10.0)).errors
     assert np.abs(errors[0]).max() == 0.0 and np.abs(errors[-1]).max() > 0.1
     rests = "once the leader's input rests at its trim"
-    assert rests in ech.guarantee(parts, settings()).sentence()
+    assert rests in in_words(ech.guarantee(parts, settings()))
 
 
 def test_a_parent_that_is_the_leader_relays():
@@ -379,8 +381,8 @@ def test_the_report_says_whether_the_proof_covers_the_run(swinging, factor, worl
 def test_a_run_that_will_grow_says_what_would_not(echelon):
     quick = ["--set", "simulation.horizon=0.5", "--set", "simulation.dt=0.05", "--no-figures"]
     code, _, err = echelon("run", "planar-quadrotor", *quick, "--out", "o")
-    assert code == 0 and err.startswith("echelon: Nothing is guaranteed: with the input held over")
-    [shorter] = re.findall("There is a guarantee with `--set (simulation.dt=[^`]*)`", err)
+    assert code == 0 and err.startswith("echelon: Not guaranteed\n  since")
+    [shorter] = re.findall("with +`--set (simulation.dt=[^`]*)` there is a guarantee", err)
     assert ech.guarantee(*ech.build(ech.load_scenario("planar-quadrotor", [shorter]))).promised
     assert echelon("run", "planar-quadrotor", *quick, "--out", "p", "--json")[2] == ""
 
@@ -390,16 +392,17 @@ def test_the_data_of_a_run_hold_the_whole_promise():
     gain = ech.synthesize(model, PATH, ech.gains.Riccati())
     parts = parts_of(model, PATH, gain)
     result = ech.simulate(parts, settings(horizon=0.1))
-    told, data = ech.summary(result)["promise"], ech.dataset(result)
+    told, data = ech.summary(result)["guarantee"], ech.dataset(result)
+    assert told.pop("covered") is None
     assert told == ech.guarantee(parts, settings(horizon=0.1)).as_mapping()
     # These lines are there only for laws that turn, graphs that switch, motors, networks, ...
     apart = {Hypothesis.HEADING_FRAME, Hypothesis.SWITCHING, Hypothesis.LIMITS}
     apart |= {Hypothesis.AGES, Hypothesis.HELD, Hypothesis.LEADER}
     apart |= {Hypothesis.MESSAGES, Hypothesis.OWN_STATE, Hypothesis.SEPARATION, Hypothesis.EVENTS}
     always = {h.value for h in Hypothesis if h not in apart}
-    assert {each["statement"] for each in told["hypotheses"]} == always
-    for each in told["hypotheses"]:
-        assert each["number"] is None or isinstance(each["number"], (int, float))
+    assert {each["name"] for each in told["conditions"]} == always
+    for each in told["conditions"]:
+        assert each["value"] is None or isinstance(each["value"], (int, float))
     np.testing.assert_array_equal(data["P"], gain.P)
     np.testing.assert_array_equal(data["R"], gain.R)
     assert float(data["coupling"]) == gain.coupling
@@ -445,7 +448,7 @@ def test_a_guarantee_is_stored_for_its_parts_and_settings_alone(monkeypatch):
         (stopping(model=OwnCart()), settings()),
         (stopping(), settings()),
     ):
-        module.guaranteed(parts, chosen)
+        module.guarantee_data(parts, chosen)
     *keys, own, again = [digest(values) for values in stored]
     assert None not in keys and len({*keys}) == len(keys) and again == keys[0]
     # Nothing is stored of a user's model.
@@ -455,9 +458,8 @@ def test_a_guarantee_is_stored_for_its_parts_and_settings_alone(monkeypatch):
 def test_plans_are_promised_nothing():
     model, goals = ech.models.DoubleIntegrator(2), ech.Formation(np.zeros((4, 4)))
     parts = ech.Parts(model, PATH, goals, ech.optimal.Plans(ech.references.Circle()))
-    assert ech.guarantee(parts, settings()).sentence() == (
-        "Nothing is guaranteed: no theorem covers `Plans`. What would help: use laws that a "
-        "theorem covers."
+    assert in_words(ech.guarantee(parts, settings())) == (
+        "Not guaranteed since no theorem covers `Plans` would help use laws that a theorem covers"
     )
 
 
@@ -486,7 +488,7 @@ def test_a_trim_needs_room_on_both_sides_of_its_input(low, high, promised):
     type(model).input_limits = ech.models.Limits(((1.0,),), (low,), (high,))
     parts = parts_of(model, PATH, identity_gain(model))
     promise = ech.guarantee(parts, settings())
-    assert promise.promised == promised != ("actuators" in promise.sentence())
+    assert promise.promised == promised != ("actuators" in in_words(promise))
     assert ech.guarantee(parts, settings(limits=False)).promised
 
 
@@ -498,7 +500,7 @@ def test_slopes_of_both_sides_that_contract_are_promised_without_a_linearization
     grows = of_one_state(lambda x: -x + 3.0 * jnp.abs(x))
     promise = ech.guarantee(parts_of(grows, PATH, identity_gain(grows)), settings())
     assert not promise.promised
-    assert "the rate of `x` bends or jumps with `x` at the trim" in promise.sentence()
+    assert "the rate of `x` bends or jumps with `x` at the trim" in in_words(promise)
     model = of_one_state(lambda x: -2.0 * x + jnp.maximum(x, 0.0))
     promise = ech.guarantee(parts_of(model, PATH, identity_gain(model)), settings())
     assert promise.promised and (promise.kind, promise.theorem) == (Kind.VERTICES, Theorem.T1)
@@ -590,10 +592,9 @@ def test_no_mode_and_no_edge_is_told_of_a_model_that_bends_at_its_trim(method):
     parts = parts_of(model, PATH, gain, initial={"x": 0.1})
     promise, run = ech.guarantee(parts, settings()), settings(horizon=0.1)
     assert promise.promised and promise.theorem is Theorem.T1
-    assert promise.sentence().startswith("Guaranteed on a domain only")
-    told = promise.as_mapping()
-    assert (told["slowest_mode"], told["edge"]) == (None, None)
-    for text in (promise.sentence(), ech.report(ech.simulate(parts, run))):
+    assert in_words(promise).startswith("Guaranteed (vertices of a hull, T1)")
+    assert not {"slowest_mode", "edge"} & promise.as_mapping()["numbers"].keys()
+    for text in (in_words(promise), ech.report(ech.simulate(parts, run))):
         assert not any(words in " ".join(text.split()) for words in NOTHING_LINEAR)
     for line in ech.check(parts, settings()).lines:
         # What a gain says of itself is compared, and promises nothing.
@@ -631,13 +632,13 @@ class RestPromise(Guarantee):
         case = GuaranteeInputs(prepared.parts, settings, loop_of(prepared.parts), leaders)
         own = (statement.holds(name, Kind.PROOF, "it rests") for name in REQUIRED)
         lines = {line.statement: line for line in (*agent_lines(case), *own)}
-        return cls(loop=case.loop, hypotheses=lines, without="", leader_mode=None)
+        return cls(loop=case.loop, hypotheses=lines, ignores=(), leader_mode=None)
 
     def longest_step(self, settings):
         return float("inf")
 
-    def guarantee(self):
-        return "Followers rest where they start."
+    def claim(self):
+        return Claim(ClaimKind.BOUNDED, ("where they start",))
 
     def why_covered(self):
         return "nobody moved"
@@ -655,10 +656,10 @@ def test_a_law_names_what_proves_its_guarantee():
     parts = ech.Parts(model, PATH, goals, ech.Laws(TrimInput(), Rest()))
     found = ech.guarantee(parts, settings())
     assert type(found) is RestPromise and found.decays
-    assert found.as_mapping()["sentence"] == "Followers rest where they start."
+    assert found.as_mapping()["claim"] == "bounded"
     assert ech.check(parts, settings()).promise is found
     report = ech.report(ech.simulate(parts, settings(horizon=0.1)))
-    assert "Followers rest where they start." in report
+    assert "V stays from where they start" in " ".join(report.split())
     seeds = [settings()._replace(seed=k) for k in range(2)]
     assert [type(each) for each in promises(parts, seeds)] == [RestPromise, RestPromise]
     other = parts.replace(drive=ech.Laws(TrimInput(), TrimInput()))

@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+from in_words import in_words
 
 import echelon as ech
 from echelon.core.statement import Hypothesis
@@ -34,13 +35,13 @@ def test_a_position_that_was_seen_at_samples_alone_is_not_called_proved(monkeypa
     # As of outputs whose equations no trace follows.
     monkeypatch.setattr(separation, "flat_states_of", lambda *_: FlatStates((), ()))
     seen = guarantee(parts, SETTINGS._replace(horizon=2.0))
-    assert seen.separation.kind is Kind.SAMPLES and seen.sentence().startswith("Seen at samples")
+    assert seen.separation.kind is Kind.SAMPLES and in_words(seen).startswith("Seen at samples")
 
 
 def test_distances_are_guaranteed_and_convergence_is_not():
     _, value = guaranteed()
     assert value.theorem is Theorem.T10 and value.promised and value.rate is None
-    text = value.sentence()
+    text = in_words(value)
     assert "radii of 0.1 x 0.1 m never overlap" in text and "Convergence is not guaranteed" in text
     assert "converge to zero" not in text and "observed" not in text
     # The proof is of continuous time and of agents whose actuators deliver what the law asks.
@@ -67,18 +68,18 @@ def test_distances_are_guaranteed_and_convergence_is_not():
 def test_in_a_world_that_is_not_ideal_distances_are_observed(world):
     _, value = guaranteed(**world)
     assert value.hypotheses[Hypothesis.SEPARATION].fails
-    assert "In this world distances are observed, not proved." in value.sentence()
-    assert "converge to zero" not in value.sentence()
+    assert "In this world distances are observed, not proved." in in_words(value)
+    assert "converge to zero" not in in_words(value)
 
 
 def test_numbers_in_a_sentence_state_no_more_than_is_guaranteed():
     """Radii are rounded down, and times up."""
     _, value = guaranteed(ech.Safety(radii=(0.123456, 0.123456, 0.3), margin=0.0))
-    assert "radii of 0.1234 x 0.1234 m" in value.sentence()
+    assert "radii of 0.1234 x 0.1234 m" in in_words(value)
     slow = ech.laws.StoppingPoint(rate=0.12, coupling=0.12, speed=100.0)
     drive = ech.Laws(ech.laws.StoppingLeader(rate=0.12), slow)
     value = guarantee(guaranteed()[0].replace(drive=drive), SETTINGS)
-    shown = float(value.sentence().split("within 1 cm after ")[1].split(" s")[0])
+    shown = float(in_words(value).split("within 1 cm after ")[1].split(" s")[0])
     assert 10.0 < value.tube.arrival <= shown <= value.tube.arrival + 1.0
 
 
@@ -107,12 +108,12 @@ FORGERIES = {
 
 
 def test_claims_of_distances_are_checked_by_code_of_its_own(tmp_path):
-    document = json.loads(json.dumps({"promise": guaranteed()[1].as_mapping()}))
+    document = json.loads(json.dumps({"guarantee": guaranteed()[1].as_mapping()}))
     file = tmp_path / "summary.json"
     file.write_text(json.dumps(document))
     assert verify(file).verdict == "incomplete"
     for name, forge in FORGERIES.items():
         forged = copy.deepcopy(document)
-        forge(forged["promise"]["anywhere"]["separation"])
+        forge(forged["guarantee"]["anywhere"]["separation"])
         file.write_text(json.dumps(forged))
         assert verify(file).verdict == "refused", name

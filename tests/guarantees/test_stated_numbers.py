@@ -9,19 +9,20 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from in_words import in_words
 
 import echelon as ech
+from echelon.core.claim import Number, Rounding
 from echelon.core.statement import Hypothesis, Topic
 from echelon.core.words import Kind, Theorem, Verdict
 from echelon.experiments.studies.basin import Radii
 from echelon.guarantees.messages.late_messages import AgeLimits, LateMessages, LateRate
-from echelon.guarantees.promises.promise import Prefix
 from echelon.guarantees.promises.region import CertifiedSet, set_line
 from echelon.guarantees.stopping.motor_load import Alone, MotorLoad
 from echelon.guarantees.stopping.separation import Separation
 from echelon.guarantees.stopping.tube import Tube
 from echelon.laws.law import TrimInput
-from echelon.output.viewer.replay import promise_badge
+from echelon.output.viewer.replay import guarantee_badge
 from echelon.synthesis.certificates.domain import Domain
 
 BELOW, ABOVE = -1, 1
@@ -38,7 +39,7 @@ def assert_safe(text, number, side):
 
 
 def tube(rate=1.0, arrival=None, motors=None, network=None):
-    return Tube(rate, (1.0,), 1.0, 1.0, arrival, "", (), motors, network=network)
+    return Tube(rate, (1.0,), 1.0, 1.0, arrival, ("any",), (), motors, network=network)
 
 
 def late(steps=3, dt=1.0, **changes):
@@ -60,18 +61,41 @@ def apart(**changes):
     return Separation(**rest | numbers | changes)
 
 
+def data(numbers, what="converges", theorem="T5", **more):
+    """A guarantee as its data."""
+    stated = {"verdict": "guaranteed", "claim": what, "theorem": theorem, "kind": "proof"}
+    lists = dict.fromkeys(("start", "graphs", "premises", "notes", "conditions", "ignores"), ())
+    shown = {name: x.as_mapping() for name, x in numbers.items()}
+    return stated | lists | {"numbers": shown} | more
+
+
+def said(found):
+    """What is said of a tube, or of distances."""
+    claim, rate = found.claim(), getattr(found, "rate", None)
+    numbers = {} if rate is None else {"rate": Number(rate, "1/s", Rounding.DOWN)}
+    phrases = {name: getattr(claim, name) for name in ("start", "graphs", "premises", "notes")}
+    stated = data(numbers | dict(claim.numbers), str(claim.what), str(found.theorem), **phrases)
+    return in_words(stated)
+
+
 def motors(least=0.01, largest=0.1, most=0.2, tilt=0.1, alone=None):
     return MotorLoad(least, largest, most, tilt, alone, {})
 
 
+def loaded(**numbers):
+    return said(tube(motors=motors(**numbers)))
+
+
 def alone(**changes):
     one = Alone(0.1, 1.0, 1.0, 1.0, False)._replace(**changes)
-    return motors(alone=one).sentence()
+    return said(tube(motors=motors(alone=one)))
 
 
 def badge(rate, theorem="T1", slowest=None):
-    told = {"promised": True, "sentence": "", "rate": rate, "kind": "proof", "theorem": theorem}
-    return promise_badge(told | {"slowest_mode": -rate if slowest is None else slowest})
+    slowest = -rate if slowest is None else slowest
+    modes = Number(rate, "1/s", Rounding.DOWN), Number(slowest, "1/s", Rounding.UP), Number(2.0)
+    names = "rate", "slowest_mode", "coupling"
+    return guarantee_badge(data(dict(zip(names, modes, strict=True)), theorem=theorem))
 
 
 def domain(bounds):
@@ -80,39 +104,43 @@ def domain(bounds):
 
 
 KINDS = {
-    "rate of T5": (BELOW, r"decay at (\S+) 1/s", lambda x: tube(x).sentence()),
-    "arrival of T5": (ABOVE, r"1 cm after (\S+) s", lambda x: tube(arrival=x).sentence()),
-    "arrival of T9": (ABOVE, r"1 cm after (\S+) s", lambda x: late().sentence(x)),
-    "rate of T9": (BELOW, r"at (\S+) 1/s while", lambda x: both_ways(x).faster()),
-    "age of T9": (BELOW, r"older than (\S+) ms", lambda x: late(dt=x / 3e3, ways=None,
-        rates=(LateRate(2.0, np.ones(2)),)).faster()),
-    "packets": (ABOVE, r"has a packet after (\S+) s", lambda x: late(dt=x / 3.0).sentence(None)),
-    "delay": (ABOVE, r"a delay of (\S+) s", lambda x: late(dt=x / 6.0).sentence(None)),
-    "rate of T10": (BELOW, r"decay at (\S+) 1/s", lambda x: apart(tube=tube(x)).sentence()),
-    "radii": (BELOW, r"radii of (\S+) x", lambda x: apart(
-        safety=ech.Safety(radii=(x, x, x))).sentence()),
+    "rate of T5": (BELOW, r"rate (\S+) 1/s", lambda x: said(tube(x))),
+    "arrival of T5": (ABOVE, r"after (\S+) s from", lambda x: said(tube(arrival=x))),
+    "arrival of T9": (ABOVE, r"after (\S+) s from", lambda x: said(
+        tube(arrival=x, network=late()))),
+    "rate of T9": (BELOW, r"(\S+) 1/s while", lambda x: said(tube(network=both_ways(x)))),
+    "age of T9": (BELOW, r"older than (\S+) ms", lambda x: said(tube(network=late(
+        dt=x / 3e3, ways=None, rates=(LateRate(2.0, np.ones(2)),))))),
+    "packets": (ABOVE, r"a packet after (\S+) s", lambda x: said(tube(network=late(dt=x / 3.0)))),
+    "delay": (ABOVE, r"a delay of (\S+) s", lambda x: said(tube(network=late(dt=x / 6.0)))),
+    "rate of T10": (BELOW, r"rate (\S+) 1/s", lambda x: said(apart(tube=tube(x)))),
+    "radii": (BELOW, r"ellipsoids of (\S+) x", lambda x: said(apart(
+        safety=ech.Safety(radii=(x, x, x))))),
     "distance": (BELOW, r"(\S+) m at the start", lambda x: apart(least=x).line.number_text),
     "kept": (BELOW, r"(\S+) m are kept", lambda x: apart(
         safety=ech.Safety(radii=(0.5 * x, 0.5 * x, x), margin=0.0)).line.text),
-    "thrust, least": (BELOW, r"between (\S+) and", lambda x: motors(least=x).sentence()),
-    "thrust, largest": (ABOVE, r"and (\S+) N", lambda x: motors(largest=x).sentence()),
-    "tilt": (ABOVE, r"is at most (\S+) deg", lambda x: motors(tilt=math.radians(x)).sentence()),
+    "kept, claimed": (BELOW, r"(\S+) m are kept", lambda x: said(apart(
+        safety=ech.Safety(radii=(0.5 * x, 0.5 * x, x), margin=0.0)))),
+    "thrust, least": (BELOW, r"motors (\S+) N to", lambda x: loaded(least=x)),
+    "thrust, largest": (ABOVE, r"to (\S+) N, of", lambda x: loaded(largest=x)),
+    "tilt": (ABOVE, r"tilt (\S+) deg at", lambda x: loaded(tilt=math.radians(x))),
     "start, tilt": (BELOW, r"a tilt of (\S+) deg", lambda x: alone(tilt=math.radians(x))),
-    "start, sideways": (BELOW, r"or (\S+) m/s sideways", lambda x: alone(sideways=x)),
+    "start, sideways": (BELOW, r"(\S+) m/s sideways", lambda x: alone(sideways=x)),
     "start, upward": (BELOW, r"or (\S+) m/s upward", lambda x: alone(upward=x)),
-    "start, rate": (BELOW, r"or (\S+) rad/s", lambda x: alone(rate=x)),
+    "start, rate": (BELOW, r"(\S+) rad/s of roll", lambda x: alone(rate=x)),
     "set": (BELOW, r"radius (\S+)$", lambda x: set_line(
         None, CertifiedSet(x, Kind.PROOF, "")).number_text),
     "domain, upper end": (BELOW, r", (\S+)\]", lambda x: domain({"position": (-1.0, x)})),
     "domain, lower end": (BELOW, r"\[-(\S+),", lambda x: domain({"position": (-x, 1.0)})),
-    "until an event": (BELOW, r"Until (\S+) s", lambda x: Prefix(x, tube()).sentence()),
+    "until an event": (BELOW, r"until (\S+) s", lambda x: in_words(data(
+        {}, until={"at": x, "guarantee": data({})}))),
     "certified radius": (BELOW, r"certified (\S+);", lambda x: Radii(
         ("x", "y"), x, 1.0, 2.0, 1.0).sentence()),
     "observed radius": (BELOW, r"observed (\S+),", lambda x: Radii(
         ("x", "y"), 1.0, x, 2.0 * x, 1.0).sentence()),
     "badge": (BELOW, r": (\S+) 1/s", lambda x: badge(x)["short"]),
-    "badge, by linearization": (BELOW, r"rate of (\S+) 1/s", lambda x: badge(x, None)["whole"]),
-    "badge, slowest": (BELOW, r"decays at (\S+) 1/s", lambda x: badge(
+    "badge, by linearization": (BELOW, r"rate +(\S+) 1/s", lambda x: badge(x, None)["whole"]),
+    "badge, slowest": (BELOW, r"decays\s+at (\S+)\s+1/s", lambda x: badge(
         0.5 * x, None, -x)["whole"]),
 }  # fmt: skip
 
@@ -129,8 +157,8 @@ def test_a_sentence_states_no_more_than_its_number(kind, x):
 @settings(max_examples=100, deadline=None)
 @given(SIZES, st.floats(1.0, 1.001))
 def test_a_thrust_that_suffices_is_not_stated_above_the_limit(x, more):
-    text = motors(largest=x, most=more * x).sentence()
-    [(largest, most)] = re.findall(r"and (\S+) N \(maximum (\S+) N", text)
+    text = loaded(largest=x, most=more * x)
+    [(largest, most)] = re.findall(r"to (\S+) N, of (\S+) N", text)
     assert float(largest) <= float(most)
 
 
@@ -139,8 +167,8 @@ def test_a_thrust_that_suffices_is_not_stated_above_the_limit(x, more):
 def test_the_sentence_of_a_region_states_no_more(robust, rate, radius):
     region = dataclasses.replace(robust.region, rate=rate)
     certified = CertifiedSet(radius, region.kind, "")
-    text = dataclasses.replace(robust, region=region, certified=certified).sentence()
-    assert_safe(re.findall(r"shrink at (\S+) 1/s", text)[0], rate, BELOW)
+    text = in_words(dataclasses.replace(robust, region=region, certified=certified))
+    assert_safe(re.findall(r"rate (\S+) 1/s", text)[0], rate, BELOW)
     assert_safe(re.findall(r"<= (\S+)\^2", text)[0], radius, BELOW)
 
 
@@ -206,11 +234,11 @@ def test_a_guarantee_in_single_precision_says_that_it_ignores_its_rounding():
     circle = ech.references.Circle(center=(3e5, 0.0, 0.0))
     laws = ech.Laws(ech.laws.StoppingLeader(reference=circle), ech.laws.StoppingPoint())
     parts = line_of(ech.models.DoubleIntegrator(2), ech.Graph.path(3), laws)
-    said = "The guarantee ignores that numbers have single precision."
+    ignored = "ignores numbers have single precision"
     for precision, left_out in (("float64", False), ("float32", True)):
         chosen = ech.Settings(horizon=6.0, dt=0.01, precision=precision)
         found, result = ech.guarantee(parts, chosen), ech.simulate(parts, chosen)
-        assert found.promised and (said in found.sentence()) is left_out
+        assert found.promised and (ignored in in_words(found)) is left_out
         late = result.times >= found.tube.arrival
         assert (result.formation_errors[late].max() > 0.02) == left_out
 
@@ -235,7 +263,7 @@ def test_nothing_is_stated_in_metres_of_positions_in_other_units(x, y, unit):
     ):
         parts = line_of(model, graph, laws, **more)
         checked = ech.check(parts, chosen)
-        told = [checked.promise.sentence(), ech.report(ech.simulate(parts, chosen))]
+        told = [in_words(checked.promise), ech.report(ech.simulate(parts, chosen))]
         told += [f"{line.number_text} {line.explanation}" for line in checked.lines]
         assert [text for text in told if METRES.search(text)] == []
         assert "world" not in more or f" {unit}/s" in " ".join(told)

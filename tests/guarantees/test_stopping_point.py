@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import scipy.integrate
 import scipy.linalg
+from in_words import in_words
 
 import echelon as ech
 from echelon.agents.models.chains import Chains, chains_of, differentiate, look_for_chains, to_flat
@@ -358,7 +359,7 @@ def test_integrators_are_promised_from_everywhere_and_arrive_in_time(graph, told
     parts = flight(graph, rate=3.0, feedforward=told)
     found, flown = promised(parts), outside(fly(parts))
     assert found.theorem is Theorem.T5 and found.kind is Kind.PROOF
-    assert "any state of any agent" in found.sentence()
+    assert "any state of any agent" in in_words(found)
     assert flown <= found.tube.arrival + 0.02 <= 1.6 * flown
 
 
@@ -417,7 +418,7 @@ def test_stretches_that_no_step_reaches_are_not_counted_on():
     steps, rows = turning(0.002, 0.01).graph.schedule.switches(0.01, 1.0)
     assert set(rows[steps < 100].tolist()) == {0}
     none = promised(turning(0.002, 0.01))
-    assert not none.promised and "rounded up to steps of 0.01 s" in none.sentence()
+    assert not none.promised and "rounded up to steps of 0.01 s" in in_words(none)
     assert not promised(turning(0.5, float(np.pi))).promised
     found = promised(turning(0.1, 1 / 3))
     schedule = found.run.parts.graph.schedule
@@ -454,12 +455,12 @@ def test_a_vehicle_is_promised_as_far_as_its_thrust_reaches(tmp_path):
     assert found.tube.steepest == pytest.approx(5.6, abs=0.05)
     assert found.tube.gains == pytest.approx((1.0, 2.4159, 12.3925, 221.2039), rel=1e-4)
     assert found.tube.arrival < 3.3
-    assert "roll and pitch within 90 deg" in found.sentence()
+    assert "roll and pitch within 90 deg" in in_words(found)
     # What verifies it computes its tube again, and refuses a false one.
     told, file = found.as_mapping(), tmp_path / "summary.json"
 
     def verified():
-        file.write_text(json.dumps({"promise": told}))
+        file.write_text(json.dumps({"guarantee": told}))
         return verify(file)
 
     assert verified().verdict == "incomplete"
@@ -501,14 +502,14 @@ def test_what_the_tube_does_not_hold_is_told_with_what_would(change):
     found = guarantee(*ech.build(override(change)))
     assert not found.promised and found.theorem is None
     assert found.hypotheses[line].verdict is Verdict.FAILS
-    assert text in found.sentence()
+    assert text in in_words(found)
 
 
 def test_a_push_that_carries_the_leader_away_is_told():
     wind = ech.World(disturbance=ech.Disturbance(constant={"vx": 12.0}))
     parts = flight(observer=False, world=wind)
     found = promised(parts)
-    assert not found.promised and "drift away for ever" in found.sentence()
+    assert not found.promised and "drift away for ever" in in_words(found)
     assert promised(flight(observer=True, world=wind)).promised
 
 
@@ -534,7 +535,7 @@ def test_a_plant_with_drag_behind_a_straight_path_demands_its_drag(share):
     plant = ech.models.DoubleIntegrator(2, drag=0.8)
     speed, found = drifting(CARTS, plant, line, share * demand)
     assert (speed > 0.01) == (share < 1.0) != found.promised
-    assert (f"demands a speed of {at_least(demand)}" in found.sentence()) == (share < 1.0)
+    assert (f"demands a speed of {at_least(demand)}" in in_words(found)) == (share < 1.0)
 
 
 def test_drag_that_turns_with_the_path_demands_nothing_that_lasts():
@@ -554,7 +555,7 @@ def test_a_plant_of_another_mass_demands_what_it_needs_at_rest(factor, share):
     plant = ech.models.Quadrotor(mass=factor * QUADROTOR.mass)
     speed, found = drifting(QUADROTOR, plant, ech.references.Hover(), share * demand)
     assert (speed > 0.01) == (share < 1.0) != found.promised
-    assert (f"demands a speed of {at_least(demand)}" in found.sentence()) == (share < 1.0)
+    assert (f"demands a speed of {at_least(demand)}" in in_words(found)) == (share < 1.0)
 
 
 @pytest.mark.parametrize("observer", [True, False])
@@ -563,9 +564,9 @@ def test_a_current_that_carries_the_leader_away_is_told_with_an_observer_too(obs
     for push, drifts in ((1.4, False), (1.6, True)):
         current = ech.World(disturbance=ech.Disturbance(constant={"x": push}))
         found = promised(flight(observer=observer, world=current))
-        assert ("drift away for ever" in found.sentence()) == drifts != found.promised
-    assert "observer" not in found.sentence()
-    assert "raise the leader's `speed` above 1.6" in found.sentence()
+        assert ("drift away for ever" in in_words(found)) == drifts != found.promised
+    assert "observer" not in in_words(found)
+    assert "raise the leader's `speed` above 1.6" in in_words(found)
 
 
 def test_parents_add_their_speeds():
@@ -578,7 +579,7 @@ def test_parents_add_their_speeds():
         found = promised(ech.Parts(QUADROTOR, chain, formation, drive))
         assert found.claimed is fits
     # 9.81 / 2.4159 / 3 links.
-    assert "below 1.35" in found.sentence()
+    assert "below 1.35" in in_words(found)
 
 
 @pytest.mark.parametrize("roots", [SLOW_ROOTS, FAST_ROOTS])

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from held_loops import drawn_graphs, whole_steps
+from in_words import in_words
 
 import echelon as ech
 
@@ -33,8 +34,8 @@ def test_the_product_over_a_period_decides(seed):
         maps = whole_steps(A, B, K, laplacians, dt)
         radius = np.abs(np.linalg.eigvals(np.linalg.multi_dot([*maps[::-1], np.eye(len(maps[0]))])))
         step = float(radius.max() ** (1.0 / len(maps)))
-        assert found.claimed is (step < 1.0), (dt, step, found.sentence())
+        assert found.claimed is (step < 1.0), (dt, step, in_words(found))
         # A leader that falls by itself does not stay at its trim, and only the run can show it.
         falls = np.linalg.eigvals(A).real.max() > 0.0
-        assert not (found.promised and falls), (dt, found.sentence())
+        assert not (found.promised and falls), (dt, in_words(found))
         assert found.slowest == pytest.approx(np.log(step) / dt, rel=1e-6, abs=1e-9 / dt)

@@ -97,7 +97,7 @@ def test_what_is_said_of_a_law_of_ones_own_is_what_it_does(name):
     for text in ("Linearized", "does not act", "Cause"):
         assert text not in report
     assert ("nothing from others" in report) is (name == "alone")
-    assert ech.summary(result)["covered"] is None
+    assert ech.summary(result)["guarantee"]["covered"] is None
     # What it uses of others is read off its trace.
     assert parts.information.follower == USED.get(name, (NEIGHBOURS,))
 

@@ -7,6 +7,7 @@ import types
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from in_words import in_words
 from model_family import MODELS
 from plain_agents import as_python
 
@@ -232,7 +233,7 @@ def test_what_is_guaranteed_of_a_start_is_that_of_its_nearest_turn():
         starts = np.array([facing(Carrier(), y, -0.6 * k) for k, y in enumerate((3.1, yaw, 3.1))])
         hover = ech.references.Hover(position=(0.0, 0.0, 0.0), yaw=3.1)
         parts = stopping(Carrier(), reference=hover, initial=starts)
-        sentences.add(ech.guarantee(parts, settings).sentence())
+        sentences.add(in_words(ech.guarantee(parts, settings)))
     [sentence] = sentences
     assert "after 0 s" in sentence or "1 cm" in sentence
 

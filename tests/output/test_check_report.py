@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import pytest
+from in_words import in_words
 
 import echelon as ech
 from echelon.core.statement import Hypothesis, Topic, fails, holds, unneeded
@@ -21,7 +22,7 @@ def test_a_check_of_a_bundled_scenario_fits_a_terminal(name):
     text = check_report(found)
     lines = text.splitlines()
     assert len(lines) <= HEIGHT == 40 and max(map(len, lines)) <= WIDTH == 80
-    assert " ".join(text.split()).startswith(found.promise.sentence())
+    assert " ".join(text.split()).startswith(in_words(found.promise))
     # Whatever fails has its line, those of the paper's text after all that this loop rests on.
     rows = [k for k, line in enumerate(lines) if "  fails  " in line]
     assert len(rows) == sum(line.fails for line in found.lines)

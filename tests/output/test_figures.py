@@ -11,7 +11,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from recordings import PROMISE, as_file, flown, swinging, tracked, with_errors
+from recordings import GUARANTEE, as_file, flown, swinging, tracked, with_errors
 
 from echelon.agents.network.switching import Schedule
 from echelon.core.errors import OutputError
@@ -22,14 +22,8 @@ from echelon.output.plots.over_time import start_of
 from echelon.output.plots.run_figures import NAMES, figures
 from echelon.output.plots.style import ONE_COLUMN, TWO_COLUMNS, leader_pen, pen
 
-CERTIFIED = PROMISE | {
-    "theorem": "T1",
-    "kind": "proof",
-    "certified_set": {"radius": 9.0, "kind": "proof", "why": ""},
-    "hypotheses": [{"statement": "starts in the certified set", "verdict": "holds"}],
-}
+CERTIFIED = GUARANTEE | {"theorem": "T1", "kind": "proof", "covers_start": True}
 FEW = ("trajectories", "formation", "inputs")
-WINDY = {"statement": "Assumption 3, exact states", "verdict": "fails"}
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +68,7 @@ def test_the_slope_that_is_promised_is_drawn_from_the_largest_error_on(run):
         (t0, first), (t1, last) = lines_of(figures(run, [name])[name])[label]
         assert name == "lyapunov" or (first == worst.max() and t0 == run.times[worst.argmax()])
         assert np.log(last / first) == pytest.approx(rate * (t1 - t0))
-    none = dataclasses.replace(run, promise=PROMISE | {"promised": False, "rate": None})
+    none = dataclasses.replace(run, guarantee=GUARANTEE | {"verdict": "none", "claim": None})
     for name, figure in figures(none, ["formation", "lyapunov"]).items():
         assert not [k for k in lines_of(figure) if "guaranteed" in k], name
 
@@ -87,7 +81,7 @@ def test_a_bound_is_drawn_where_a_theorem_gives_one_and_it_bounds_what_shrinks_s
     shrink = np.exp(-0.5 * run.times)[:, None, None]
     errors = shrink * rng.normal(size=(1, 4, 12))
     errors[:, 0] = 0.0
-    proved = dataclasses.replace(with_errors(run, errors), metric=P, promise=CERTIFIED)
+    proved = dataclasses.replace(with_errors(run, errors), metric=P, guarantee=CERTIFIED)
     bound = proved.error_bound()
     assert (bound[:, None] >= proved.formation_errors).all()
     drawn = lines_of(figures(proved, ["formation"])["formation"])["bound, by proof (T1)"]
@@ -99,7 +93,9 @@ def test_a_bound_is_drawn_where_a_theorem_gives_one_and_it_bounds_what_shrinks_s
     worst[0, 1] = block[:, :3] @ direction
     tight = with_errors(proved, shrink * worst)
     np.testing.assert_allclose(tight.error_bound(), tight.formation_errors[:, 1], rtol=1e-9)
-    proved = dataclasses.replace(run, metric=1e4 * np.diag([1.0] + [1e-4] * 11), promise=CERTIFIED)
+    proved = dataclasses.replace(
+        run, metric=1e4 * np.diag([1.0] + [1e-4] * 11), guarantee=CERTIFIED
+    )
     bound = proved.error_bound()
     (ax,) = figures(proved, ["formation"])["formation"].axes
     assert bound[0] > 10.0 * run.formation_errors.max()
@@ -111,14 +107,14 @@ def test_a_bound_is_drawn_where_a_theorem_gives_one_and_it_bounds_what_shrinks_s
     [
         {"saturated": np.array([0.0, 0.1, 0.0, 0.0])},
         {"metric": None},
-        {"promise": CERTIFIED | {"theorem": "T2"}},
-        {"promise": CERTIFIED | {"hypotheses": []}},
-        {"promise": CERTIFIED | {"promised": False}},
-        {"promise": CERTIFIED | {"hypotheses": [*CERTIFIED["hypotheses"], WINDY]}},
+        {"guarantee": CERTIFIED | {"theorem": "T2"}},
+        {"guarantee": CERTIFIED | {"covers_start": None}},
+        {"guarantee": CERTIFIED | {"claim": None}},
+        {"guarantee": CERTIFIED | {"ignores": ["wind or noise acts on the agents"]}},
     ],
 )
 def test_no_bound_is_drawn_that_is_not_promised_of_the_run(run, spoiled):
-    proved = dataclasses.replace(run, metric=np.eye(12), promise=CERTIFIED)
+    proved = dataclasses.replace(run, metric=np.eye(12), guarantee=CERTIFIED)
     assert proved.error_bound() is not None
     assert dataclasses.replace(proved, **spoiled).error_bound() is None
 

@@ -200,7 +200,7 @@ def test_a_run_from_disk_is_verified_as_its_folder_is(own):
     assert ech.verify(folder).verdict == "incomplete"
     assert ech.verify(folder, scenario=folder).holds and ech.verify(ech.load(folder)).holds
     with h5netcdf.File(folder / "run.nc", "r+") as data:
-        data.attrs["promise"] = data.attrs["promise"].replace("linearization", "vertices")
+        data.attrs["guarantee"] = data.attrs["guarantee"].replace("linearization", "vertices")
     assert ech.verify(ech.load(folder)).verdict == "refused"
 
 

@@ -6,10 +6,12 @@ import h5py
 import jax
 import numpy as np
 import pytest
+from in_words import in_words
 
 import echelon as ech
 from echelon.core.errors import EchelonError
 from echelon.guarantees.promises.hypotheses import events_in_words
+from echelon.output.reports.guarantee_text import through_event
 from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.step.assembly import assemble
 from echelon.simulation.step.sequence import begin, step
@@ -173,9 +175,9 @@ def test_losses_and_cuts_that_are_covered_are_guaranteed_and_others_until_a_lead
     without = ech.guarantee(
         parts.replace(events=[Cut((1, 2), 1.0, 0.5)]), SETTINGS._replace(horizon=3.0)
     )
-    assert guarantee.prefix.promise.sentence() == without.sentence()
-    assert "from 3.01 s on" in guarantee.sentence() and "Until 3.01 s: " in guarantee.sentence()
-    assert guarantee.as_mapping()["prefix"]["promise"]["promised"]
+    assert in_words(guarantee.prefix.promise) == in_words(without)
+    assert "until 3.01 s: guaranteed (exact proof, T5)" in in_words(guarantee)
+    assert guarantee.as_mapping()["until"]["guarantee"]["verdict"] == "guaranteed"
     # At its first step nothing comes before it.
     at_once = _parts(events=[Lose(0, 0.01)], leadership=ech.Leadership((1,)))
     assert ech.guarantee(at_once, SETTINGS).prefix is None
@@ -199,12 +201,11 @@ def test_an_event_is_not_covered_by_a_guarantee_that_ignores_how_messages_and_ag
     """As before the event: what the guarantee of the run leaves out, that of an event does too."""
     parts = _parts(events=[Lose(3, 2.0), Cut((1, 2), 3.0, 1.0)]).replace(world=world)
     guarantee = ech.guarantee(parts, SETTINGS)
-    assert ignored in guarantee.sentence()
+    assert ignored in in_words(guarantee)
     for event in events_in_words(parts, guarantee):
         stated = event["guarantee"]
-        assert not stated["promised"] and stated["kind"] is None
-        assert stated["sentence"].startswith("The guarantee would ")
-        assert stated["sentence"].endswith(f" The guarantee ignores that {ignored}.")
+        assert stated["verdict"] == "none" and stated["kind"] is None
+        assert through_event(stated) == f"The guarantee covers it, but ignores that {ignored}."
 
 
 @pytest.mark.parametrize(
@@ -218,7 +219,7 @@ def test_an_event_is_not_covered_by_a_guarantee_that_ignores_how_messages_and_ag
 )
 def test_an_event_between_two_steps_is_guaranteed_as_at_the_later_one(event, later):
     between, on = (ech.guarantee(_parts(events=[each]), SETTINGS) for each in (event, later))
-    assert on.promised and between.sentence() == on.sentence()
+    assert on.promised and in_words(between) == in_words(on)
     assert between.rate == on.rate
 
 
@@ -251,7 +252,7 @@ def test_who_hears_nearer_neighbours_alone_may_be_left_behind_by_an_event():
     for event in (Lose(1, 0.2), Cut((0, 1), 0.2)):
         guarantee = ech.guarantee(_parts(ring, drive, events=[event]), SETTINGS)
         assert not guarantee.promised and guarantee.rate is None
-        assert "no path to the leader along neighbours that are nearer" in guarantee.sentence()
+        assert "no path to the leader along neighbours that are nearer" in in_words(guarantee)
         # Truly: whoever hears nobody stays off.
         run = ech.simulate(_parts(ring, drive, events=[event]), SETTINGS)
         assert run.formation_errors[-1].max() > 0.1

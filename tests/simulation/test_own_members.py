@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from carts import carts
+from in_words import in_words
 
 import echelon as ech
 from echelon.agents.network.channel import Channel
@@ -145,7 +146,7 @@ def test_of_a_member_that_counts_steps_nothing_is_guaranteed_and_machine_code_la
     settings = ech.Settings(horizon=1.0, dt=DT)
     promised = ech.guarantee(parts, settings)
     assert str(promised.verdict) == "none"
-    assert "`SlowSensor` depends on time" in promised.sentence()
+    assert "`SlowSensor` depends on time" in in_words(promised)
     with pytest.raises(EchelonError, match="member `SlowSensor` of your own"):
         ech.simulate(parts, settings._replace(engine="native"))
 

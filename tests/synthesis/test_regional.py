@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from in_words import in_words
 
 import echelon as ech
 from echelon.core.numerics import precision
@@ -306,7 +307,7 @@ def test_a_broken_offset_and_a_missing_relay_are_named():
     assert line.text.startswith("the offset of agent 1: it changes the drift")
     lines, found = verdicts("paper", "follower.feedforward=none")
     assert lines["leader's motion is matched"].verdict is Verdict.FAILS
-    assert "once the leader's input rests" in found.promise.sentence()
+    assert "once the leader's input rests" in in_words(found.promise)
 
 
 def test_a_weak_input_weakens_the_trim_thrust_too():
@@ -320,7 +321,7 @@ def test_check_exits_by_what_is_promised_and_by_a_missing_solver(echelon, monkey
     code, out, err = echelon("check", "paper")
     assert (code, err) == (0, "") and "Local guarantee (linearization)" in out
     code, out, _ = echelon("check", "paper-literal", "--json")
-    assert code == 1 and json.loads(out)["promise"]["promised"] is False
+    assert code == 1 and json.loads(out)["guarantee"]["verdict"] == "none"
     monkeypatch.setitem(sys.modules, "cvxpy", None)
     robust = "follower.gain={method: robust-lqr, domain: {position: 0.5, velocity: 0.5}}"
     code, _, err = echelon("run", "van-der-pol", "--set", robust)

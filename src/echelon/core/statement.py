@@ -1,6 +1,7 @@
 """Statements of a check: the verdict, the kind of the argument, and a remedy."""
 
 import dataclasses
+import re
 from typing import NamedTuple, TypeAlias, final
 
 from echelon.core.words import Kind, Verdict, Word
@@ -76,6 +77,13 @@ class Cause(NamedTuple):
     remedy: str
 
 
+_UNITS = {"1/s": "1/s", "ms": "s", "s": "s", "m": "m", "N": "N", "Hz": "Hz", "m/s": "m/s"}
+"""How a table writes a number's unit, and the unit of the number itself."""
+_UNIT = re.compile(
+    rf"\d (?P<unit>{'|'.join(sorted(map(re.escape, _UNITS), key=len)[::-1])})(?![\w/^])"
+)
+
+
 @final
 @dataclasses.dataclass(frozen=True)
 class Statement:
@@ -91,8 +99,7 @@ class Statement:
         remedy: what would be needed; empty where nothing fails.
         reason: what the failure says against any promise; empty where it leaves one.
         condition: what the claim is conditional on, since the failure leaves it to the run.
-        limit: beside which the number stands; None where there is none.
-        unit: of both.
+        limit: beside which the number stands, in its unit; None where there is none.
     """
 
     statement: Line
@@ -105,7 +112,6 @@ class Statement:
     reason: str = ""
     condition: str = ""
     limit: float | None = None
-    unit: str = ""
 
     def __post_init__(self) -> None:
         """Hold that nobody is left with a failure and nothing to do."""
@@ -125,6 +131,14 @@ class Statement:
     def fails(self) -> bool:
         """Whether it was found false."""
         return self.verdict is Verdict.FAILS
+
+    @property
+    def unit(self) -> str:
+        """The unit of the number: that of the text in which a table has it."""
+        named = _UNIT.search(self.number_text)
+        # Its number is a spectral radius, and a table shows the step.
+        named = None if self.statement is Hypothesis.SAMPLING else named
+        return "" if named is None else _UNITS[named["unit"]]
 
     @property
     def explanation(self) -> str:
@@ -154,10 +168,15 @@ def _finite(number: float | None) -> float | None:
 
 
 def holds(
-    statement: Line, kind: Kind, text: str, number: float | None = None, number_text: str = ""
+    statement: Line,
+    kind: Kind,
+    text: str,
+    number: float | None = None,
+    number_text: str = "",
+    limit: float | None = None,
 ) -> Statement:
     """Return the line of what was found true."""
-    return Statement(statement, Verdict.HOLDS, kind, number, number_text, text)
+    return Statement(statement, Verdict.HOLDS, kind, number, number_text, text, limit=limit)
 
 
 def fails(
@@ -166,12 +185,14 @@ def fails(
     text: str,
     number: float | None = None,
     number_text: str = "",
+    limit: float | None = None,
     *,
     remedy: str,
     reason: str = "",
 ) -> Statement:
     """Return the line of what was found false; with a `reason` it rules out any guarantee."""
-    return Statement(statement, Verdict.FAILS, kind, number, number_text, text, remedy, reason)
+    found = Statement(statement, Verdict.FAILS, kind, number, number_text, text, remedy, reason)
+    return dataclasses.replace(found, limit=limit)
 
 
 def unneeded(

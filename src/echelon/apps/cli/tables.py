@@ -178,13 +178,15 @@ def foretell(experiment: "Experiment", quiet: bool) -> None:
         return
     from echelon.experiments.studies.design import ways_out
     from echelon.guarantees.promises.promise import guarantee
-    from echelon.output.reports.guarantee_text import guarantee_text
+    from echelon.output.reports.guarantee_text import guarantee_lines, guarantee_text
     from echelon.simulation.engine.prepare import prepare
 
     warn(prepare(*experiment).warnings)
     stated = guarantee(*experiment)
-    if sys.stderr.isatty() or not stated.claimed:
+    if not stated.claimed:
         print(f"echelon: {guarantee_text(stated)}", file=sys.stderr, flush=True)
+    elif sys.stderr.isatty():
+        print(f"echelon: {guarantee_lines(stated)[0]}", file=sys.stderr, flush=True)
     for change in ways_out(*experiment):
         print(f"  with {'':9}`--set {change}` there is a guarantee", file=sys.stderr, flush=True)
 

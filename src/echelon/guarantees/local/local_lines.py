@@ -99,7 +99,7 @@ def _decays(parts: Parts, settings: Settings, local: LocalCertificate, shorter: 
         return fails(name, _LINEAR, text, remedy="take fewer agents", reason=text)
     rate, dt = local.rate(settings.dt), settings.dt
     shown = "" if rate is None else f"{at_least(-rate)} 1/s"
-    number = None if rate is None else -rate, shown
+    number = None if rate is None else -rate, shown, 0.0
     over = f"over {amount(local.modes, 'mode')} of the steps that run"
     if Fault.LASTING in local.faults:
         text = "the law uses a remembered number that never changes, so errors may stay"
@@ -163,13 +163,13 @@ def _held(parts: Parts, settings: Settings, local: LocalCertificate) -> Statemen
         return unneeded(name, _LINEAR, text, None, dt)
     text = f"spectral radius {at_least(exact, 7)} a step if agents move exactly under held inputs"
     if exact < 1.0:
-        return holds(name, _LINEAR, text, exact, dt)
+        return holds(name, _LINEAR, text, exact, dt, 1.0)
     reason, remedy = "", _against_growth(parts)
     if local.radius < 1.0:
         text += "; the integrator damps what grows"
         reason = "if inputs are held and agents move exactly, errors grow"
         remedy = "shorten `simulation.dt`, or lower the gain"
-    return fails(name, _LINEAR, text, exact, dt, remedy=remedy, reason=reason)
+    return fails(name, _LINEAR, text, exact, dt, 1.0, remedy=remedy, reason=reason)
 
 
 def _switches(parts: Parts, local: LocalCertificate) -> Iterator[Statement]:

@@ -204,7 +204,9 @@ def _bent(case: GuaranteeInputs) -> Iterator[Statement]:
     else:
         text = "by the slopes on all sides of the trim, where the model is not differentiable"
         rate = -region.rate
-        yield holds(Hypothesis.DISAGREEMENT_DECAY, region.kind, text, rate, f"{at_least(rate)} 1/s")
+        yield holds(
+            Hypothesis.DISAGREEMENT_DECAY, region.kind, text, rate, f"{at_least(rate)} 1/s", 0.0
+        )
     yield _sampled_bend(case)
 
 
@@ -220,10 +222,10 @@ def _sampled_bend(case: GuaranteeInputs) -> Statement:
     radius = max(exact, sampled_radius(A, loop.linear.B, loop.gains, *settings.held))
     text = f"spectral radius {at_least(radius, 4)} a step, over the slopes of all sides of the trim"
     if radius < 1.0:
-        return holds(name, Kind.SAMPLES, text, radius, dt_text)
+        return holds(name, Kind.SAMPLES, text, radius, dt_text, 1.0)
     text = f"the step `dt` = {dt:g} s is too long for this gain: {text}"
     remedy = "shorten `simulation.dt`, or lower the gain"
-    return fails(name, Kind.SAMPLES, text, radius, dt_text, remedy=remedy, reason=_GROWS)
+    return fails(name, Kind.SAMPLES, text, radius, dt_text, 1.0, remedy=remedy, reason=_GROWS)
 
 
 # ---- where it has a linearization ---------------------------------------------------------------
@@ -247,7 +249,7 @@ def _coupled(case: GuaranteeInputs) -> Statement:
     edge, c = case.loop.certificate.edge, case.loop.closed.coupling
     if edge is None:
         return holds(Hypothesis.COUPLING, Kind.PROOF, "no edge is known", c, f"c {about(c, 4)}")
-    number = c, f"c {about(c, 4)}, edge {at_least(edge, 4)}"
+    number = c, f"c {about(c, 4)}, edge {at_least(edge, 4)}", edge
     if c >= edge:
         text = "from the edge on every mode decays: near the trim, and of linear agents anywhere"
         return holds(Hypothesis.COUPLING, Kind.PROOF, text, *number)

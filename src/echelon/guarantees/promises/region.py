@@ -391,7 +391,7 @@ def starts_line(
     if certified is None:
         return unneeded(Hypothesis.STARTS, Kind.PROOF, _no_set(region))
     size = size_of(parts, states)
-    number = size, f"{at_least(size)} of {at_most(certified.radius)}"
+    number = size, f"{at_least(size)} of {at_most(certified.radius)}", certified.radius
     if size <= certified.radius:
         text = "no follower leaves the domain from these starts"
         return holds(Hypothesis.STARTS, certified.kind, text, *number)

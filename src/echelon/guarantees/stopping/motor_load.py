@@ -309,7 +309,8 @@ def motor_load_of(run: StoppingRun, brief: bool = False) -> tuple[MotorLoad | No
     number = None if motors.slope is None else float(motors.least), _thrust_text(motors)
     if not motors.within(most):
         text = "the motors are not proved to suffice from these starts"
-        text += f": {number[1]}" if number[1] else ", and the thrust is not proved to stay positive"
+        need = f": they need {number[1]}, and have 0 .. {at_most(float(most), 4)} N"
+        text += need if number[1] else ", and the thrust is not proved to stay positive"
         remedy = "choose gentler `roots`, such as [2, 2.5, 3], or a lower `speed`, or start nearer "
         remedy += "to the leader's velocity and attitude"
         return None, _at_limits(text, *number, remedy, kind)

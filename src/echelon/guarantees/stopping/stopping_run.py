@@ -406,14 +406,16 @@ def condition_lines(run: StoppingRun) -> Iterator[Statement]:
     if run.network is not None:
         text = "everybody predicts zeta' by the leader's plan and the packet that it has of it"
     yield holds(Hypothesis.MATCHED_MOTION, _PROOF, text)
-    yield holds(Hypothesis.COUPLING, _PROOF, "any coupling suffices", c, f"c {about(c, 4)}, edge 0")
+    yield holds(
+        Hypothesis.COUPLING, _PROOF, "any coupling suffices", c, f"c {about(c, 4)}, edge 0", 0.0
+    )
     text = "c lambda_min" if run.network is None else "the agreement over late messages"
     if run.parts.graph.schedule is not None:
         text = "the agreement over a period, or eventually"
     text += ", and the leaders' own coupling" * run.apart
     text = f"the slowest of the roots, {text}; far away the `speed` limits it"
     text += ", and not while agents hold each other back" * (run.law.safety is not None)
-    rate = -run.rate, f"{at_least(-run.rate)} 1/s"
+    rate = -run.rate, f"{at_least(-run.rate)} 1/s", 0.0
     yield holds(Hypothesis.DISAGREEMENT_DECAY, _PROOF, text, *rate)
     text = "the law is linear in flat coordinates everywhere"
     yield unneeded(Hypothesis.ALONG_PATH, _PROOF, text)
@@ -455,10 +457,12 @@ def _step_line(run: StoppingRun) -> Statement:
         # Its distance from its path would grow, on which the tube and the motors rest.
         text = f"the leader's step `dt` = {dt:g} s is too long: c dt = {at_least(own)} is above 1"
         remedy = f"lower `leader.coupling` to {at_most(1.0 / dt, 4)}"
-        return fails(name, Kind.LINEARIZATION, text, own, share_text, remedy=remedy, reason=text)
+        return fails(
+            name, Kind.LINEARIZATION, text, own, share_text, 1.0, remedy=remedy, reason=text
+        )
     if share <= 1.0 + 1e-12 and radius < 1.0:
         text = f"Euler's step of zeta does not grow; spectral radius {at_least(radius, 4)} a step"
-        return holds(name, Kind.LINEARIZATION, text, share, share_text)
+        return holds(name, Kind.LINEARIZATION, text, share, share_text, 1.0)
     text = f"the step `dt` = {dt:g} s is too long: c d_max dt = {at_least(share)} is above 1"
     remedy = f"lower `coupling` to {at_most(1.0 / (run.heaviest * dt), 4)}, or shorten "
     remedy += f"`simulation.dt` to {at_most(1.0 / (c * run.heaviest))} s"
@@ -466,7 +470,7 @@ def _step_line(run: StoppingRun) -> Statement:
         text = f"the step `dt` = {dt:g} s is too long for this coupling and these roots: spectral "
         text += f"radius {at_least(radius, 4)}"
         remedy = "lower `coupling` or `roots`, or shorten `simulation.dt`"
-    return fails(name, Kind.LINEARIZATION, text, share, share_text, remedy=remedy, reason=text)
+    return fails(name, Kind.LINEARIZATION, text, share, share_text, 1.0, remedy=remedy, reason=text)
 
 
 def _step_radius(run: StoppingRun, loop: FlatLoop, strengths: Array) -> float:
