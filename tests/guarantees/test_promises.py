@@ -363,7 +363,7 @@ NOT = "The proof does not cover this run: "
     ("factor", "world", "told"),
     [
         (0.9, ech.World(), "The proof covers this run: the starts lie in the certified set"),
-        (1.02, ech.World(), "but all agents stayed in the domain"),
+        (1.02, ech.World(), "and all agents stayed in the domain"),
         (4.0, ech.World(), f"{NOT}agent 3 left the domain at 0."),
         (0.5, WIND, f"{NOT}wind or noise acts on the agents."),
     ],

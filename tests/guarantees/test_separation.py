@@ -35,17 +35,17 @@ def test_a_position_that_was_seen_at_samples_alone_is_not_called_proved(monkeypa
     # As of outputs whose equations no trace follows.
     monkeypatch.setattr(separation, "flat_states_of", lambda *_: FlatStates((), ()))
     seen = guarantee(parts, SETTINGS._replace(horizon=2.0))
-    assert seen.separation.kind is Kind.SAMPLES and in_words(seen).startswith("Seen at samples")
+    assert seen.separation.kind is Kind.SAMPLES and "(seen at samples, T10)" in in_words(seen)
 
 
 def test_distances_are_guaranteed_and_convergence_is_not():
     _, value = guaranteed()
     assert value.theorem is Theorem.T10 and value.promised and value.rate is None
     text = in_words(value)
-    assert "radii of 0.1 x 0.1 m never overlap" in text and "Convergence is not guaranteed" in text
-    assert "converge to zero" not in text and "observed" not in text
+    assert "ellipsoids of 0.1 x 0.1 m about the agents never overlap" in text
+    assert "convergence is not guaranteed" in text and "converges" not in text
     # The proof is of continuous time and of agents whose actuators deliver what the law asks.
-    assert "time is continuous, no input is at a limit" in text and "held for" in text
+    assert "time is continuous no input is at a limit" in text and "held for" in text
     assert value.hypotheses[Hypothesis.SEPARATION].kind is value.tube.kind
     line = value.hypotheses[Hypothesis.SEPARATION]
     assert not line.fails
@@ -68,14 +68,14 @@ def test_distances_are_guaranteed_and_convergence_is_not():
 def test_in_a_world_that_is_not_ideal_distances_are_observed(world):
     _, value = guaranteed(**world)
     assert value.hypotheses[Hypothesis.SEPARATION].fails
-    assert "In this world distances are observed, not proved." in in_words(value)
-    assert "converge to zero" not in in_words(value)
+    assert not value.promised and "the world is ideal" in value.conditions
+    assert "converges" not in in_words(value)
 
 
 def test_numbers_in_a_sentence_state_no_more_than_is_guaranteed():
     """Radii are rounded down, and times up."""
     _, value = guaranteed(ech.Safety(radii=(0.123456, 0.123456, 0.3), margin=0.0))
-    assert "radii of 0.1234 x 0.1234 m" in in_words(value)
+    assert "ellipsoids of 0.1234 x 0.1234 m" in in_words(value)
     slow = ech.laws.StoppingPoint(rate=0.12, coupling=0.12, speed=100.0)
     drive = ech.Laws(ech.laws.StoppingLeader(rate=0.12), slow)
     value = guarantee(guaranteed()[0].replace(drive=drive), SETTINGS)

@@ -203,7 +203,7 @@ def broken(told):
         "`coupling` must be a finite number (to 1e50)": told | {"coupling": 1e60},
         "`graph.directed` must be true or false": with_graph(told, directed="false"),
         no_text: told | {"model": model},
-        "`promise` is unknown": told | {"guarantee": {"anywhere": {}}},
+        "`guarantee` is unknown": told | {"guarantee": {"anywhere": {}}},
         "`coupl\\u0456ng` is unknown": told | {"coupl\u0456ng": 1e9},
         "`certificate.region.hull.theorem` is unknown": changed(told, hull=hull | {"theorem": 1}),
         "`graph.agents` must be a whole number from 2 on (to 1e9)": with_graph(told, agents=True),
@@ -356,7 +356,7 @@ def test_a_run_without_what_it_promised_is_told_so(echelon, here):
         '{"guarantee": {': "the file `run/summary.json` is not valid JSON: ",
         "[1]": "`run/summary.json` must be a mapping.",
         '{"gain": {"coupling": 1.0}}': "`run` has lost its `gain.json`; `echelon run run --out",
-        '{"gain": null}': "`run/summary.json` is damaged: it has no `promise`.",
+        '{"gain": null}': "`run/summary.json` is damaged: it has no `guarantee`.",
     }.items():
         (here / "run" / "summary.json").write_text(summary)
         code, _, fault = echelon("verify", "run")

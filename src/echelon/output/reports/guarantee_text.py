@@ -85,7 +85,7 @@ def heading(data: JsonObject) -> str:
     if verdict is GuaranteeVerdict.NONE:
         return "Not guaranteed"
     word = "Guaranteed" if verdict is GuaranteeVerdict.GUARANTEED else "Conditional"
-    return f"{word} ({source})"
+    return f"{word} ({source})" + ", but for what it ignores" * bool(data["ignores"])
 
 
 def guarantee_rows(data: JsonObject) -> Iterator[Row]:
@@ -216,13 +216,9 @@ def short_form(data: JsonObject) -> str:
     if verdict is GuaranteeVerdict.CONDITIONAL:
         return f"no guarantee: {data['theorem'] or data['kind']} holds while {left[0]}"
     if data["claim"] == str(ClaimKind.APART):
-        ideal = not data["ignores"]
-        return f"guaranteed: agents stay apart, {data['theorem']}" if ideal else OBSERVED
+        return f"guaranteed: agents stay apart, {data['theorem']}"
     rate = f"{shown(data, 'rate')}" if number_in(data, "rate") else "V does not rise"
     return f"guaranteed: {rate}, {data['theorem'] or data['kind']}"
-
-
-OBSERVED = "distances observed, not proved"
 
 
 def through_event(data: JsonObject) -> str:

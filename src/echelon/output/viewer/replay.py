@@ -11,11 +11,10 @@ import numpy as np
 from echelon.core.claim import number_in
 from echelon.core.errors import OutputError
 from echelon.core.types import Array, JsonObject
-from echelon.core.words import GuaranteeVerdict
 from echelon.experiments.results.recording import Recording
 from echelon.output.plots.space import Space, body_width, clipped_places, space_of
 from echelon.output.plots.style import raised
-from echelon.output.reports.guarantee_text import OBSERVED, guarantee_text, short_form
+from echelon.output.reports.guarantee_text import guarantee_text, short_form
 from echelon.output.viewer.charts import charts_of
 from echelon.output.viewer.page import BYTE, COARSE, Group, pack, page
 from echelon_flight.page_server import Handler
@@ -214,11 +213,9 @@ def facts(run: Recording) -> list[str]:
 
 def guarantee_badge(stated: JsonObject) -> dict[str, str]:
     """Return the badge of a guarantee: `holds`, `edge` or `lost`, a short and a whole text."""
-    verdict, short = GuaranteeVerdict.named(stated["verdict"]), short_form(stated)
-    observed = verdict is GuaranteeVerdict.GUARANTEED and short == OBSERVED
-    states = {GuaranteeVerdict.GUARANTEED: "holds", GuaranteeVerdict.NONE: "lost"}
-    state = "edge" if observed else states.get(verdict, "edge")
-    return {"state": state, "short": short, "whole": guarantee_text(stated)}
+    states = {"guaranteed": "holds", "conditional": "edge", "none": "lost"}
+    state = states[stated["verdict"]]
+    return {"state": state, "short": short_form(stated), "whole": guarantee_text(stated)}
 
 
 def _badge_of_run(run: Recording) -> dict[str, str] | None:
