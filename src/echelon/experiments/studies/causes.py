@@ -212,13 +212,13 @@ def _finished(result: Result) -> Result:
     return result
 
 
-def moved_starts(parts: Parts, seed: int, draw: int, single: bool) -> Parts:
+def moved_starts(parts: Parts, seed: int, draw: int, single: bool, by: float = _MOVED) -> Parts:
     """Return the parts with all starts moved by 1e-9, or by a few digits of single precision."""
     starts = Starts(parts)
     states = starts(seed)
     random = np.random.default_rng(draw).uniform(-1.0, 1.0, states.shape)
     digits = 4.0 * np.finfo(np.float32).eps * np.abs(states) if single else 0.0
-    states = states + random * (_MOVED + digits)
+    states = states + random * (by + digits)
     # Added again to leaders whose states are given.
     states[list(parts.graph.leaders)] -= starts.error
     return parts.replace(initial=dict(enumerate(states)))
