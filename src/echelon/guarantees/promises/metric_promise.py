@@ -239,6 +239,6 @@ class MetricPromise(Guarantee):
         starts = self.hypotheses[Hypothesis.STARTS]
         if starts.fails:
             text = f"the starts lie outside of the certified set ({starts.number_text}), but all "
-            return f"{text}agents stayed in the domain at every stored frame"
+            return f"{text}agents stayed in the domain in every step"
         text = f"the starts lie in the certified set ({starts.number_text}), and all agents stayed "
         return f"{text}in the domain"
