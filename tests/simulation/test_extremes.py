@@ -1,11 +1,13 @@
 """The lowest and highest deviation of each state over all steps, whatever frames are stored."""
 
 import h5py
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import echelon as ech
 from echelon.core.words import Theorem
+from echelon.guarantees.promises.coverage import covered
 
 MODEL, GRAPH = ech.models.DoubleIntegrator(), ech.Graph.path(3)
 SETTINGS = ech.Settings(horizon=4.0, dt=0.02, store_every=500)
@@ -16,6 +18,18 @@ def parts_of(domain, model=MODEL, **more):
     gain = ech.synthesize(model, GRAPH, ech.gains.RobustLQR(domain=domain))
     laws = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain, feedforward="relay"))
     return ech.Parts(model, GRAPH, ech.Formation.line(model, GRAPH), laws, **more)
+
+
+class Bent(ech.ControlAffine):
+    """A model with two slopes at its trim, whose domain no gain names."""
+
+    state_names, input_names, position = ("x",), ("u",), ("x",)
+
+    def drift(self, x):
+        return -0.5 * jnp.abs(x) - x
+
+    def input_map(self, x):
+        return jnp.ones((1, 1))
 
 
 BOX = {"position": 1.0, "velocity": 4.0}
@@ -123,6 +137,18 @@ def test_a_run_is_covered_exactly_if_no_step_leaves_the_domain(every, velocity, 
     else:
         when = "in some step" if every > 1 else "at 0.14 s"
         assert f"does not cover this run: agent 2 left the domain {when} (`x`)." in said
+
+
+@pytest.mark.parametrize(("start", "kept"), [(0.5, False), (5e-4, True)])
+def test_steps_count_in_the_domain_about_a_kink_too(start, kept):
+    gain = ech.synthesize(Bent(), GRAPH, ech.gains.FixedGain([[1.0]], coupling=3.0))
+    laws = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain, feedforward="relay"))
+    formation, starts = ech.Formation(np.zeros((3, 1))), start * np.array([[0.0], [1.0], [1.0]])
+    parts = ech.Parts(Bent(), GRAPH, formation, laws, starts)
+    promise = ech.guarantee(parts, SETTINGS)
+    assert gain.certificate.region is None and promise.theorem is Theorem.T1
+    result = ech.simulate(parts, SETTINGS)
+    assert extremes(result).shape == (2, 3, 2) and covered(result, promise) is kept
 
 
 def test_a_run_from_disk_has_its_extremes_and_a_file_without_them_is_refused(tmp_path):

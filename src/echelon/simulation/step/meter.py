@@ -220,8 +220,10 @@ class RunStatistics(eqx.Module):
         return self.bounded * (len(self.model.state_names) + len(self.model.input_names))
 
     def zero_sums(self, xp: ModuleType = jnp) -> Sums:
-        """Return the sums of no step, as arrays of JAX or of NumPy."""
-        # The precision that is switched on now: float32 within a float32 run.
+        """Return the sums of no step, as arrays of JAX or of NumPy.
+
+        They have the precision that is switched on now: float32 within a float32 run.
+        """
         dtype = jax.dtypes.canonicalize_dtype(np.float64)
         agents, leaders, q = len(self.offsets), len(self.leaders), len(self.model.output_names)
         return Sums(
@@ -231,10 +233,9 @@ class RunStatistics(eqx.Module):
             outputs=xp.zeros((leaders, q), dtype),
             effort=xp.zeros(agents, dtype),
             spacing=xp.zeros(len(self.edges), dtype),
-            limited=xp.zeros(agents, np.int32),
+            **dict.fromkeys(("limited", "chatter"), xp.zeros(agents, np.int32)),
             unsettled=xp.full(agents, -1, np.int32),
             inside=xp.full((agents, len(self.charted)), ALWAYS, np.int32),
-            chatter=xp.zeros(agents, np.int32),
             separation=xp.full((agents, self.slices), jnp.inf, dtype),
             avoidance=xp.zeros((agents, self.slices), dtype),
             closest=xp.full(min(1, len(self.paired)), jnp.inf, dtype),
