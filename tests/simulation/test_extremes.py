@@ -8,6 +8,7 @@ import pytest
 import echelon as ech
 from echelon.core.words import Theorem
 from echelon.guarantees.promises.coverage import covered
+from echelon.simulation.engine.batch import Batch
 
 MODEL, GRAPH = ech.models.DoubleIntegrator(), ech.Graph.path(3)
 SETTINGS = ech.Settings(horizon=4.0, dt=0.02, store_every=500)
@@ -100,6 +101,15 @@ def test_a_continued_run_has_the_same_extremes(engine):
     assert 0 < part.sums.steps[0] < whole.sums.steps[0]
     again = ech.simulate(parts, settings, before=stretches)
     np.testing.assert_array_equal(extremes(again), extremes(whole))
+
+
+def test_runs_of_a_batch_have_the_extremes_of_each_alone():
+    parts = parts_of(BOX, initial={"position": 0.5})
+    runs = [(parts, SETTINGS._replace(seed=seed)) for seed in range(9)]
+    for one, (parts, settings) in zip(Batch(1).fly(runs), runs, strict=True):
+        np.testing.assert_allclose(
+            extremes(one), extremes(ech.simulate(parts, settings)), atol=1e-12
+        )
 
 
 def test_steps_in_which_an_agent_is_absent_do_not_count():
