@@ -1,5 +1,7 @@
 """What a varying g adds along the leader's path: a guarantee needs the leader's own inputs."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -7,6 +9,7 @@ from in_words import in_words
 
 import echelon as ech
 from echelon.core.words import Theorem
+from echelon.guarantees.promises.coverage import coverage, covered
 
 LINE = ech.Graph.path(4)
 
@@ -27,12 +30,16 @@ class Growing(ech.ControlAffine):
         return derivatives[0]
 
 
-def promised(leader, **inputs):
-    """The guarantee on half a unit of both axes and these inputs, behind a leader under a gain."""
-    model, settings = Growing(), ech.Settings(4.0, 0.01)
+def parts_of(leader, **inputs):
+    """Parts on half a unit of both axes and these inputs, behind a leader under a gain."""
+    model = Growing()
     gain = ech.synthesize(model, LINE, ech.gains.RobustLQR({"x": 0.5, "y": 0.5, **inputs}))
     drive = ech.Laws(leader(gain), ech.laws.Consensus(gain, feedforward="relay"))
-    return ech.guarantee(ech.Parts(model, LINE, ech.Formation(np.zeros((4, 2))), drive), settings)
+    return ech.Parts(model, LINE, ech.Formation(np.zeros((4, 2))), drive)
+
+
+def promised(leader, **inputs):
+    return ech.guarantee(parts_of(leader, **inputs), ech.Settings(4.0, 0.01))
 
 
 def pushed(gain, push):
@@ -66,3 +73,20 @@ def test_a_domain_says_which_inputs_stay_at_the_trim():
     assert found.theorem is Theorem.T2
     assert "vx in [-0.5, 0.5], vy at its trim" in found.domain
     assert "vy at its trim" in in_words(found)
+
+
+@pytest.mark.parametrize(("agent", "entry", "said"), [(0, 0, "`x`"), (0, 3, "`vy`"), (1, 0, "")])
+def test_states_and_inputs_of_the_leader_count_in_every_step_and_those_of_followers_do_not(
+    agent, entry, said
+):
+    parts = parts_of(lambda gain: pushed(gain, 0.3), vx=0.5, vy=0.5)
+    settings = ech.Settings(4.0, 0.01, store_every=200)
+    result, promise = ech.simulate(parts, settings), ech.guarantee(parts, settings)
+    assert promise.theorem is Theorem.T2 and covered(result, promise) is True
+    # In some step between the three frames.
+    highest = result.sums.highest.copy()
+    highest[agent, entry] = 0.6
+    seen = dataclasses.replace(result, sums=result.sums._replace(highest=highest))
+    assert covered(seen, promise) is not bool(said)
+    text = " ".join(coverage(seen, promise))
+    assert (f"agent 0 left the domain in some step ({said})" in text) is bool(said)

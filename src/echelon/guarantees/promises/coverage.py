@@ -4,9 +4,9 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from echelon.core.digits import about
-from echelon.core.statement import Hypothesis
 from echelon.core.types import Array
 from echelon.core.words import Kind, Theorem
 from echelon.guarantees.promises.promise import Guarantee
@@ -16,7 +16,10 @@ _EDGE = 1e-9  # relative; a state that rests on a bound has not left it
 
 
 class Exit(NamedTuple):
-    """Who was outside of the domain first, at which stored time (s), in which state or input."""
+    """Who was outside of the domain first, when (s), in which state or input.
+
+    The time is that of a stored frame; infinite where no stored frame shows it.
+    """
 
     time: float
     agent: int
@@ -30,10 +33,7 @@ def coverage(result: Result, promise: Guarantee) -> Iterator[str]:
     what = "proof" if promise.kind is Kind.PROOF else "guarantee on the domain"
     what = "conditional claim" if promise.conditions else what
     against = _against(result, promise)
-    if not against and _unseen(result, promise):
-        text = f"Whether the {what} covers this run is not known: agents may have left the domain "
-        yield f"{text}between the stored frames."
-    elif against:
+    if against:
         yield f"The {what} does not cover this run: {against}."
     else:
         yield f"The {what} covers this run: {promise.why_covered()}."
@@ -42,12 +42,11 @@ def coverage(result: Result, promise: Guarantee) -> Iterator[str]:
 def covered(result: Result, promise: Guarantee) -> bool | None:
     """Return whether a run kept, in every step, to what a theorem's claim rests on.
 
-    None where no theorem claims anything, and where the stored frames do not show it.
+    None where no theorem claims anything.
     """
     if promise.theorem is None or not len(result.times):
         return None
-    against = _against(result, promise)
-    return None if not against and _unseen(result, promise) else not against
+    return not _against(result, promise)
 
 
 def _against(result: Result, promise: Guarantee) -> str:
@@ -55,44 +54,53 @@ def _against(result: Result, promise: Guarantee) -> str:
     left = None if promise.region is None else first_exit(result, promise)
     limited = float(result.saturated.max())
     if left is not None:
-        return f"agent {left.agent} left the domain at {about(left.time, 4)} s (`{left.name}`)"
+        when = f"at {about(left.time, 4)} s" if np.isfinite(left.time) else "in some step"
+        return f"agent {left.agent} left the domain {when} (`{left.name}`)"
     if limited:
         return f"a limit acted on an agent in {about(100.0 * limited)} % of the steps"
     return " and ".join(promise.ignores)
 
 
-def _unseen(result: Result, promise: Guarantee) -> bool:
-    """Tell whether stored frames alone show that agents stayed in the domain."""
-    certified = not promise.hypotheses[Hypothesis.STARTS].fails and promise.theorem != Theorem.T2
-    return promise.region is not None and not certified and result.settings.store_every > 1
-
-
 def first_exit(result: Result, promise: Guarantee) -> Exit | None:
-    """Return who leaves the domain first, its offset aside; None where nobody does.
+    """Return who leaves the domain in a step, its offset aside; None where nobody does.
 
-    T1 and A5 ask it of all agents. T2 asks it of the leaders, and of their inputs, with which the
-    slopes of a varying g count.
+    It is the first in the stored frames, else one of those between them. T1 and A5 ask it of all
+    agents. T2 asks it of the leaders, and of their inputs, with which the slopes of a varying g
+    count.
     """
     region, model, graph = promise.region, result.model, result.graph
     assert region is not None
     domain, leads, local = region.domain, list(graph.leaders), promise.theorem is Theorem.T2
     who = leads if local else list(range(graph.agents))
-    x = (result.states - result.formation.offsets)[:, who] - np.asarray(model.trim[0], float)
+    n, rows, here = len(model.state_names), _extremes(result), result.presence
+    x = result.states - result.offsets_in()
+    x = x if here is None else np.where(here[:, :, None], x, np.nan)
+    x = np.concatenate([x[:, who], rows[:, who, :n]]) - np.asarray(model.trim[0], float)
     exits = [_outside(result, x, (domain.lower, domain.upper), who, model.state_names)]
     if local:
-        v = model.normalized(result.inputs[:, leads])
+        v = np.concatenate([model.normalized(result.inputs[:, leads]), rows[:, leads, n:]])
         box = (domain.input_lower, domain.input_upper)
         exits.append(_outside(result, v, box, leads, model.input_names))
     return min((one for one in exits if one is not None), default=None)
 
 
+def _extremes(result: Result) -> Float[Array, "E N k"]:
+    """Return the lowest and highest states and inputs over all steps; none if all are stored."""
+    low, high = result.sums.lowest, result.sums.highest
+    if not low.size:
+        return np.zeros((0, *low.shape[:1], result.states.shape[2] + result.inputs.shape[2]))
+    # A number that is not finite is outside; of an agent that never was there is none.
+    rows = np.nan_to_num([low, high], nan=np.inf, posinf=np.inf, neginf=-np.inf)
+    return np.where(low > high, np.nan, rows)
+
+
 def _outside(
     result: Result, values: Array, box: tuple[Array, Array], who: list[int], names: tuple[str, ...]
 ) -> Exit | None:
-    """Return the first of values (T, K, k) outside of a box."""
+    """Return the first of values (T + E, K, k), of frames and then of all steps, outside a box."""
     low, high = (bound + _EDGE * sign * np.abs(bound) for bound, sign in zip(box, (-1.0, 1.0)))
     out = np.argwhere((values < low) | (values > high))
     if not len(out):
         return None
     frame, place, k = out[0]
-    return Exit(float(result.times[frame]), who[place], names[k])
+    return Exit(float([*result.times, np.inf, np.inf][frame]), who[place], names[k])

@@ -231,4 +231,4 @@ class MetricPromise(Guarantee):
         starts = self.hypotheses[Hypothesis.STARTS]
         where = "outside of" if starts.fails else "in"
         text = f"the starts lie {where} the certified set ({starts.number_text})"
-        return f"{text}, and all agents stayed in the domain"
+        return f"{text}, and all agents stayed in the domain in every step"

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from echelon.agents.models.linearization import at_trim
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
 from echelon.agents.network.channel import Channel
@@ -94,14 +95,13 @@ def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
         if parts.leadership is not None:
             parts.leadership.check_network(parts.world.network)
         drive.check_world(parts.world, graph, settings.dt)
+        scales = drive.safety and drive.safety.scales(model)
         problem = Problem(
             model,
             graph,
             formation,
             PlantStep.of(model, parts.world, settings, graph.agents),
-            RunStatistics.of(
-                model, graph, formation, settings, drive.safety and drive.safety.scales(model)
-            ),
+            RunStatistics.of(model, graph, formation, settings, scales, _has_domain(parts)),
             settings,
             initial_states(parts, settings.seed),
             channel,
@@ -116,6 +116,13 @@ def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
     warnings += (*part_warnings(parts, problem.states, settings),)
     # Model and drive may say the same; a dictionary keeps the first, and the order.
     return Prepared(parts, problem, tuple(dict.fromkeys(warnings)))
+
+
+def _has_domain(parts: Parts) -> bool:
+    """Return whether a theorem may ask complete parts to stay in a domain; kinks have one too."""
+    gain = parts.drive.gain
+    claimed = gain is not None and gain.certificate.region is not None
+    return claimed or (gain is not None and bool(at_trim(parts.model).kinks.any()))
 
 
 def sensors_of(parts: Parts, settings: Settings) -> Sensors:

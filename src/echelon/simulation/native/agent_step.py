@@ -48,6 +48,7 @@ class BlockRows(NamedTuple):
         errors, tracking: as in `Sums`, but of the steps before the steady window and in it.
         effort, limited, unsettled, inside, chatter, outputs: as in `Sums`.
         peak: minus the largest squared error since the last event; empty without events.
+        lowest, highest: as in `Sums`, the latter with its sign changed.
         exception: 1 where the numbers are not what JAX computes.
         total: how many rows there are.
     """
@@ -68,6 +69,8 @@ class BlockRows(NamedTuple):
     inside: range
     chatter: range
     peak: range
+    lowest: range
+    highest: range
     tracking: range
     outputs: range
     exception: range
@@ -92,7 +95,7 @@ class BlockRows(NamedTuple):
             varying,
         ]
         sizes += [2, 1, 1, 1, len(loop.meter.charted), 1]
-        sizes += [min(1, len(loop.meter.events)), 2, q, 1]
+        sizes += [min(1, len(loop.meter.events)), *[loop.meter.extremes] * 2, 2, q, 1]
         ends = np.cumsum([0, *sizes]).tolist()
         return cls._make([*(range(a, b) for a, b in itertools.pairwise(ends)), ends[-1]])
 
@@ -190,6 +193,7 @@ class StepOutputs(NamedTuple):
     limited: Entries
     unsettled: Entries
     inside: Entries
+    deviation: Entries
     chatter: Entries
     signal: Entries
     next_signal: Entries
@@ -226,6 +230,7 @@ def agent_step(loop: Loop, leads: bool) -> Callable[[StepInputs], StepOutputs]:
             limited=jnp.where(limited.any(), 1.0, 0.0),
             unsettled=metered.unsettled,
             inside=metered.inside,
+            deviation=metered.deviation,
             chatter=jnp.where((cut * inputs.previous_cut < 0.0).any(), 1.0, 0.0),
             signal=_signal_of(loop, law, x, offset, inputs.memory),
             next_signal=_signal_of(loop, law, state, offset, memory),
@@ -258,7 +263,7 @@ def body_of(
 
     leaves = varying.leaves(leaves_of(graph, "row", rows.varying))
     results = lower(step, graph, [leaves, inputs])
-    shapes = jax.tree.structure(StepOutputs(*[0] * 15)._replace(memory=law.init()))
+    shapes = jax.tree.structure(StepOutputs(*[0] * 16)._replace(memory=law.init()))
     outputs: StepOutputs = shapes.unflatten([nodes(graph, part) for part in results])
     memory = jax.tree.leaves(outputs.memory, is_leaf=lambda part: isinstance(part, list))
     stores = {"state": outputs.state, "memory": sum(memory, start=[])}
@@ -278,13 +283,15 @@ def body_of(
     if leads and follows:
         tracking = _before_and_in_window(inputs, outputs.tracking)
         sums |= {"tracking": tracking, "outputs": outputs.outputs}
-    # One row of the smallest numbers serves for the largest too.
-    peak = [graph.make("sub", 0.0, outputs.errors[0])] if len(rows.peak) else []
+    # Rows of the smallest numbers serve for the largest too.
+    minima = {"inside": outputs.inside, "lowest": outputs.deviation}
+    largest = {"peak": outputs.errors[: len(rows.peak)], "highest": outputs.deviation}
+    minima |= {name: [graph.make("sub", 0.0, x) for x in part] for name, part in largest.items()}
     subtract = functools.partial(map, functools.partial(graph.make, "unfused_sub"))
     body = Body(
         stores=_placed(rows, stores),
         sums=_placed(rows, sums),
-        minima=_placed(rows, {"inside": outputs.inside, "peak": peak}),
+        minima=_placed(rows, minima),
         on_request=_placed(rows, {"input": outputs.input}),
         tape=dict(enumerate(inputs.x[list(loop.meter.paired)].tolist())),
         mirror_before=[*subtract(inputs.x, inputs.offset), *outputs.signal],

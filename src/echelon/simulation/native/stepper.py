@@ -103,7 +103,7 @@ class NativeStepper(Stepper):
         initial = np.zeros((rows.total, self.plan.lanes), self.dtype)
         initial[rows.unsettled.start], initial[rows.inside.start : rows.inside.stop] = -1.0, ALWAYS
         # No minimum yet, as in a kernel.
-        initial[rows.peak.start : rows.peak.stop] = ALWAYS
+        initial[rows.peak.start : rows.highest.stop] = ALWAYS
         return initial[rows.errors.start :]
 
     def _reserve(self) -> None:
@@ -404,6 +404,8 @@ class NativeStepper(Stepper):
 
         peak = of(rows.peak) if len(self._events) else np.zeros((len(agent_sums), 1))
         self._end_span(end, of(rows.unsettled), peak)
+        # No minimum is infinite, as in JAX.
+        low, high = (np.where(x >= ALWAYS, np.inf, x) for x in map(of, (rows.lowest, rows.highest)))
         sums = Sums(
             steps=np.array([end - first, steady]),
             errors=_total_and_window(of(rows.errors)),
@@ -419,6 +421,8 @@ class NativeStepper(Stepper):
             **self._pairs.terms(),
             peaks=self._peaks,
             late=self._late,
+            lowest=low,
+            highest=-high,
         )
         return Sums(*(np.asarray(part, np.float64) for part in sums)).split(len(self.loops))
 

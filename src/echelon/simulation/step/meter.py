@@ -63,6 +63,8 @@ class Sums(NamedTuple):
             the next one.
         late: (N, J) the last step in the same span at which the error was above `SETTLED`; -1 if
             there is none.
+        lowest, highest: (N, n + m) the extremes of the state less the goal's offset, and of the
+            normalized input, infinite before; (N, 0) where `RunStatistics.bounded` is false.
     """
 
     steps: Total
@@ -81,6 +83,8 @@ class Sums(NamedTuple):
     met: Total
     peaks: Total
     late: Total
+    lowest: Total
+    highest: Total
 
     def plus(self, more: "Sums") -> "Sums":
         """Return the sums of two stretches of a run."""
@@ -95,6 +99,8 @@ class Sums(NamedTuple):
         met = self.met + closer[..., None] * (more.met - self.met)
         closest = self.closest.clip(None, more.closest)
         total = total._replace(peaks=self.peaks.clip(more.peaks), late=since)
+        low, high = self.lowest.clip(None, more.lowest), self.highest.clip(more.highest)
+        total = total._replace(lowest=low, highest=high)
         return total._replace(unsettled=last, inside=first, closest=closest, met=met)
 
     # ---- sums of formations: an axis F in front of each part ----
@@ -132,13 +138,14 @@ class OfAgent(NamedTuple):
     """The terms of one agent in the sums of a step: (2,) squared error, effort, and two steps.
 
     `unsettled` is the step or -1, and the maximum is kept; `inside` (k,) is the step or `ALWAYS`
-    for each bounded state, and the minimum is kept.
+    for each bounded state, and the minimum is kept. Of `deviation`, as in `Sums.lowest`, both are.
     """
 
     errors: jax.Array
     effort: jax.Array
     unsettled: jax.Array
     inside: jax.Array
+    deviation: jax.Array
 
 
 def _twice(steady: jax.Array, square: jax.Array) -> Float[jax.Array, "2"]:
@@ -166,6 +173,8 @@ class RunStatistics(eqx.Module):
     slices: int = eqx.field(static=True, default=0)
     # The states of the position, where the closest two are found at every step.
     paired: tuple[int, ...] = eqx.field(static=True, default=())
+    # Whether a domain is asked of steps between stored frames.
+    bounded: bool = eqx.field(static=True, default=False)
 
     @classmethod
     def of(
@@ -175,8 +184,12 @@ class RunStatistics(eqx.Module):
         formation: Formation,
         settings: Settings,
         scales: Array | None = None,
+        bounded: bool = False,
     ) -> "RunStatistics":
-        """Return the meter of a run, in which agents that keep apart have `scales` (d,)."""
+        """Return the meter of a run, in which agents that keep apart have `scales` (d,).
+
+        `bounded` is whether agents are to stay in the domain of a theorem.
+        """
         per_slice = steps_per_slice(settings)
         measured = measured_states(model)
         i, j = graph.edges.T
@@ -198,11 +211,19 @@ class RunStatistics(eqx.Module):
             measured=measured,
             slices=0 if scales is None else -(-settings.steps // per_slice),
             paired=measured if finds_pairs(model, graph.agents, settings) else (),
+            bounded=bounded and settings.store_every > 1,
         )
 
+    @property
+    def extremes(self) -> int:
+        """Of how many numbers of an agent the extremes are kept."""
+        return self.bounded * (len(self.model.state_names) + len(self.model.input_names))
+
     def zero_sums(self, xp: ModuleType = jnp) -> Sums:
-        """Return the sums of no step, as arrays of JAX or of NumPy."""
-        # The precision that is switched on now: float32 within a float32 run.
+        """Return the sums of no step, as arrays of JAX or of NumPy.
+
+        They have the precision that is switched on now: float32 within a float32 run.
+        """
         dtype = jax.dtypes.canonicalize_dtype(np.float64)
         agents, leaders, q = len(self.offsets), len(self.leaders), len(self.model.output_names)
         return Sums(
@@ -212,16 +233,17 @@ class RunStatistics(eqx.Module):
             outputs=xp.zeros((leaders, q), dtype),
             effort=xp.zeros(agents, dtype),
             spacing=xp.zeros(len(self.edges), dtype),
-            limited=xp.zeros(agents, np.int32),
+            **dict.fromkeys(("limited", "chatter"), xp.zeros(agents, np.int32)),
             unsettled=xp.full(agents, -1, np.int32),
             inside=xp.full((agents, len(self.charted)), ALWAYS, np.int32),
-            chatter=xp.zeros(agents, np.int32),
             separation=xp.full((agents, self.slices), jnp.inf, dtype),
             avoidance=xp.zeros((agents, self.slices), dtype),
             closest=xp.full(min(1, len(self.paired)), jnp.inf, dtype),
             met=xp.zeros((min(1, len(self.paired)), 3), np.int32),
             peaks=xp.zeros((agents, len(self.events)), dtype),
             late=xp.full((agents, len(self.events)), -1, np.int32),
+            lowest=xp.full((agents, self.extremes), jnp.inf, dtype),
+            highest=xp.full((agents, self.extremes), -jnp.inf, dtype),
         )
 
     def read(
@@ -273,6 +295,8 @@ class RunStatistics(eqx.Module):
             met=jnp.zeros((min(1, len(self.paired)), 3), jnp.int32),
             peaks=jnp.where(since, rows.errors[:, :1], 0.0),
             late=jnp.where(since, rows.unsettled[:, None], -1).astype(jnp.int32),
+            lowest=rows.deviation,
+            highest=rows.deviation,
         )
 
     def _since(self, step: jax.Array) -> Bool[jax.Array, " J"]:
@@ -288,7 +312,7 @@ class RunStatistics(eqx.Module):
         """Return the sums of a step without the agents, leaders and edges that are absent."""
         nothing, leads = self.zero_sums(), here[self.leaders]
         masks = dict.fromkeys(("effort", "limited", "unsettled", "chatter"), here)
-        spans = "inside", "separation", "avoidance", "peaks", "late"
+        spans = "inside", "separation", "avoidance", "peaks", "late", "lowest", "highest"
         masks |= dict.fromkeys(spans, here[:, None])
         masks |= {"errors": here[None], "tracking": leads[None], "outputs": leads[:, None]}
         masks["spacing"] = here[self.edges].all(axis=1)
@@ -334,7 +358,8 @@ class RunStatistics(eqx.Module):
             u: its delivered input (m,).
         """
         # y_i = x_i - xi_i, and y_i - y_0 is the deviation from the goal (theory page).
-        square = self._length(x - offset - leader)
+        y = x - offset
+        square = self._length(y - leader)
         # A newton and a newton metre cannot be added; accelerations can.
         v = self.model.normalized(u)
         out = outside(x[self.charted], *jnp.asarray(self.chart.T, x.dtype))
@@ -344,6 +369,7 @@ class RunStatistics(eqx.Module):
             # Not finite counts as unsettled: a comparison with it is false.
             unsettled=jnp.where(jnp.sqrt(square) <= SETTLED, -1, step),
             inside=jnp.where(out, step, ALWAYS),
+            deviation=jnp.concatenate([y, v]) if self.bounded else y[:0],
         )
 
     def of_leader(
