@@ -140,7 +140,7 @@ def test_only_runs_that_a_domain_is_asked_of_pay_for_extremes(engine):
 def test_a_run_is_covered_exactly_if_no_step_leaves_the_domain(every, velocity, kept):
     parts, settings = thrown(parts_of(BOX), velocity=velocity), SETTINGS._replace(store_every=every)
     result, promise = ech.simulate(parts, settings), ech.guarantee(parts, settings)
-    assert promise.theorem is Theorem.T1 and ech.summary(result)["covered"] is kept
+    assert promise.theorem is Theorem.T1 and ech.summary(result)["guarantee"]["covered"] is kept
     said = " ".join(str(ech.report(result)).split())
     if kept:
         assert "covers this run: the starts lie" in said and "in the domain in every step" in said
@@ -166,7 +166,7 @@ def test_a_run_from_disk_has_its_extremes_and_a_file_without_them_is_refused(tmp
     ech.save_dataset(result, tmp_path / "run.nc")
     again = ech.load(tmp_path / "run.nc", parts)
     np.testing.assert_array_equal(extremes(again), extremes(result))
-    assert ech.summary(again)["covered"] is False
+    assert ech.summary(again)["guarantee"]["covered"] is False
     with h5py.File(tmp_path / "run.nc", "r+") as stored:
         del stored["sums/lowest"]
     old = ech.load(tmp_path / "run.nc", parts)
