@@ -86,7 +86,7 @@ def test_every_method_has_its_row_and_the_numbers_are_those_of_its_gain(echelon)
     assert row["condition"] == pytest.approx(np.linalg.cond(gain.P), rel=1e-4)
     assert row["radius"] == pytest.approx(region.radius, rel=1e-4)
     assert (row["kind"], row["theorem"]) == (str(region.kind), str(region.theorem))
-    assert row["rate"] == region.rate and row["guarantee"]["hypotheses"]
+    assert row["rate"] == region.rate and row["guarantee"]["conditions"]
     assert rows["inner-loop"]["reason"] and "coupling" not in rows["inner-loop"]
     assert rows[told["recommended"]]["kind"] in ("proof", "vertices")
     assert told["because"].startswith(f"Recommended: {told['recommended']}. ")

@@ -4,11 +4,13 @@ from types import SimpleNamespace
 
 import pytest
 from in_words import in_words
+from recordings import GUARANTEE
 
 import echelon as ech
 from echelon.core.statement import Hypothesis, Topic, fails, holds, unneeded
 from echelon.core.words import Kind
-from echelon.output.reports.check_report import HEIGHT, WIDTH, check_report, grouped
+from echelon.output.reports.check_report import HEIGHT, check_report, grouped
+from echelon.output.reports.guarantee_text import WIDTH
 
 # Those with the most lines and the longest.
 LONG = ("paper-everything", "crossing", "paper-far")
@@ -22,7 +24,7 @@ def test_a_check_of_a_bundled_scenario_fits_a_terminal(name):
     text = check_report(found)
     lines = text.splitlines()
     assert len(lines) <= HEIGHT == 40 and max(map(len, lines)) <= WIDTH == 80
-    assert " ".join(text.split()).startswith(in_words(found.promise))
+    assert " ".join(text.split()).startswith(in_words(found.promise).partition(" if ")[0][:60])
     # Whatever fails has its line, those of the paper's text after all that this loop rests on.
     rows = [k for k, line in enumerate(lines) if "  fails  " in line]
     assert len(rows) == sum(line.fails for line in found.lines)
@@ -35,8 +37,8 @@ def test_a_check_of_a_bundled_scenario_fits_a_terminal(name):
 
 
 def found_of(make):
-    """A check with a long sentence and all lines that there are, each made by a function."""
-    promise = SimpleNamespace(sentence=lambda: "Local guarantee: " + "word " * 60)
+    """A check with a long guarantee and all lines that there are, each made by a function."""
+    promise = GUARANTEE | {"start": ["word " * 15] * 3, "notes": ["word " * 15]}
     lines = tuple(map(make, (*Hypothesis, *Topic)))
     return SimpleNamespace(promise=promise, lines=lines, warnings=(), region=None)
 

@@ -314,7 +314,7 @@ BAD = {
     "other": "cannot be read as a run: it is damaged, or was not written by echelon",
     "sweep": "is a sweep, which holds numbers of many runs",
     "comparison": "is a comparison; give one of its runs",
-    "older": "has format 3, of echelon 0.2.0, and this version reads format 4; run it again by "
+    "older": "has format 3, of echelon 0.2.0, and this version reads format 5; run it again by "
     "`echelon run FOLDER --out OTHER`.",
     "begun": "ended before any of it was stored",
 }

@@ -47,7 +47,7 @@ def test_of_the_printed_example_as_a_whole_the_report_says_when_it_leaves_floats
 def test_the_literal_law_grows_and_no_cause_is_guessed(literal):
     text = " ".join(ech.report(literal).split())
     assert "The formation error grows: 1.16 m at the start, " in text
-    assert "Nothing is guaranteed: " in text and "the law leaves out the trim input" in text
+    assert "Not guaranteed since " in text and "the law leaves out the trim input" in text
     assert "Warning" not in text and "Cause" not in text
 
 

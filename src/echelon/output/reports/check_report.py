@@ -58,7 +58,7 @@ def check_sentences(check: CheckResult) -> list[str]:
 
 
 def _text(check: CheckResult, detail: _Detail) -> Iterator[str]:
-    yield from guarantee_lines(check.promise)
+    yield from guarantee_lines(check.promise, brief=detail >= _Detail.NAMES)
     for warning in check.warnings:
         yield from textwrap.wrap(f"Warning: {warning}", WIDTH)
     width = max(len(line.name) for line in check.lines)
