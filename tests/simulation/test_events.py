@@ -86,7 +86,7 @@ def test_the_summary_states_each_event_and_what_followed(lost):
     summary = ech.summary(lost)
     assert [event["text"] for event in summary["events"]] == ["agent 3 is lost", "agent 2 joins"]
     # What is guaranteed holds until the first event that nothing covers.
-    assert [event["guarantee"]["promised"] for event in summary["events"]] == [True, False]
+    assert [x["guarantee"]["verdict"] for x in summary["events"]] == ["guaranteed", "none"]
     first, second = summary["event_outcomes"]
     late = lost.formation_errors[lost.times >= 3.0 - 1e-9]
     assert second["peak"] == pytest.approx(late.max())
