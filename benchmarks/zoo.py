@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from zoo_changes import CHANGED
+from zoo_limits import LIMITS
 from zoo_linear import LINEAR, Family, Finding
 from zoo_models import MODELS
 from zoo_paths import PATHS
@@ -431,7 +432,7 @@ def _task(pair: tuple[int, int]) -> dict[str, Any]:
 # ---- families that aim at one rule each ---------------------------------------------------------
 
 
-FAMILIES: dict[str, Family] = {**LINEAR, **CHANGED, **MODELS, **PATHS, **SUBCLASSES}
+FAMILIES: dict[str, Family] = {**LINEAR, **CHANGED, **MODELS, **PATHS, **SUBCLASSES, **LIMITS}
 
 
 def judge(family: str, seed: int, number: int) -> Finding:
@@ -457,6 +458,8 @@ def family_summary(findings: list[Finding]) -> dict[str, Any]:
         "false": [[k, *f.false] for k, f in enumerate(findings) if f.false],
         "true but refused": len(mute),
         "of those that hold": round(len(mute) / max(true, 1), 4),
+        "lost behind limits, local guarantee": sum(bool(f.local) for f in findings),
+        "at half of the region of attraction": dict(Counter(f.half for f in findings if f.half)),
         "why": Counter(f.why for f in mute).most_common(6),
         "not known": Counter(
             f.why for f in findings if not f.guaranteed and f.holds is None

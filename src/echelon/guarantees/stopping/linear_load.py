@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from echelon.agents.models.chains import flat_output
 from echelon.agents.models.declarations import is_by_user
 from echelon.agents.models.model import ControlAffine
 from echelon.core.digits import about
@@ -25,18 +26,20 @@ from echelon.guarantees.stopping.stopping_run import StoppingRun
 
 _ROUNDED = Fraction(1, 10**6)
 """Of a start in flat coordinates: a thousand times what floats leave of it."""
+_SAME = 1e-9
+"""Relative; what floats leave between `flat` and the equations."""
 _ZERO = Fraction(0)
 
 
 def linear_limits(run: StoppingRun) -> Statement | None:
     """Return that no limit acts from the starts of a run; None where that is not shown."""
     model = run.parts.model
-    limits, slopes = model.input_limits, _input_slopes(model)
+    chains = run.law.ready.chains
+    limits, slopes = model.input_limits, _input_slopes(model, chains.outputs)
     own = is_by_user(model, "limit")
     if limits is None or slopes is None or own or run.parts.formation.motion is not None:
         return None
     trim, T = slopes
-    chains = run.law.ready.chains
     pieces = pieces_of(run.leader, model, run.settings.horizon, chains.outputs, max(chains.degrees))
     if T[0].any() or np.isinf([run.speed(k) for k in range(len(chains.outputs))]).any():
         return None
@@ -53,21 +56,27 @@ def linear_limits(run: StoppingRun) -> Statement | None:
     return holds(Hypothesis.LIMITS, Kind.PROOF, text, worst, f"{about(worst)} left")
 
 
-def _input_slopes(model: ControlAffine) -> tuple[Array, Array] | None:
-    """Return u_0 (m,) and T (r + 1, m, outputs); None of an input that is not linear in them."""
-    if not model.flat_outputs:
-        return None
-    shape = model.flat_order + 1, len(model.flat_outputs)
+def _input_slopes(model: ControlAffine, outputs: tuple[str, ...]) -> tuple[Array, Array] | None:
+    """Return u_0 (m,) and T (r + 1, m, outputs); None of an input that is not linear in them.
 
-    def asked(derivatives: jax.Array) -> jax.Array:
-        return model.flat(derivatives)[1]
+    Laws invert the equations: a `flat` that agrees with them in linear terms alone is used.
+    """
+    if tuple(model.flat_outputs) != outputs:
+        return None
+    zero = jnp.zeros((model.flat_order + 2, len(outputs)))
+
+    def asked(y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        (x, u), (rate, _) = jax.jvp(model.flat, (y[:-1],), (y[1:],))
+        return u, jnp.append(model.velocity(x, u) - rate, flat_output(model, outputs, x) - y[0])
 
     with precision("float64"):
-        slope = jax.jacfwd(asked)
-        if any(used_leaves(slope, jnp.zeros(shape))):
+        slopes = jax.jacfwd(asked)
+        if any(used_leaves(slopes, zero)):
             return None
-        T, u = np.asarray(slope(jnp.zeros(shape))), np.asarray(asked(jnp.zeros(shape)))
-    return u, np.moveaxis(T, 0, 1)
+        (u, off), (T, bent) = (map(np.asarray, part(zero)) for part in (asked, slopes))
+    if np.abs(off).max() + np.abs(bent).max() > _SAME * (1.0 + np.abs(u).max() + np.abs(T).max()):
+        return None
+    return u, np.moveaxis(T, 0, 1)[:-1]
 
 
 def _range_of(run: StoppingRun, pieces: Pieces, at_rest: float, T: Array) -> tuple[float, float]:
