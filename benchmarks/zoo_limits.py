@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from held_loops import drawn_graphs
 from zoo_linear import Family, Finding, silent
+from zoo_paths import Cart
 
 import echelon as ech
 from echelon.core.words import GuaranteeVerdict, Theorem
@@ -25,7 +26,7 @@ _LOCAL = None, Theorem.T2
 """What speaks of small errors alone: nothing is said of how small."""
 
 
-# ---- agents in any array module -------------------------------------------------------------------
+# ---- agents in any array module -----------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -182,7 +183,7 @@ def drawn_plant(rng: np.random.Generator) -> Plant:
     return Plant(kind, A, B, size, tuple((rest * E).tolist()), rows, low, high, D, E)
 
 
-# ---- a formation, flown with inputs that are held -------------------------------------------------
+# ---- a formation, flown with inputs that are held -----------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -343,7 +344,9 @@ def limited_inputs(rng: np.random.Generator) -> Finding:
         for factor, end, left in zip(factors, ends, room):
             told = ask(factor * away) if end is False and left < -_CLOSE else None
             if told is not None and told.verdict is GuaranteeVerdict.GUARANTEED:
-                what = f"{told.theorem}, {factor / scale:.2g} of what limits bear at the start: lost"
+                what = (
+                    f"{told.theorem}, {factor / scale:.2g} of what limits bear at the start: lost"
+                )
                 (local if told.theorem in _LOCAL else false).append(what)
         edge = attraction(formation, away)
     half = None
@@ -369,4 +372,138 @@ def _worst(formation: Formation) -> list[np.ndarray]:
     return found
 
 
-LIMITS: dict[str, Family] = {"limits": limited_inputs}
+# ---- linear chains under stopping points --------------------------------------------------------
+
+
+class Crane(Cart):
+    """A cart with limits, whose drag may be one that its `flat` knows nothing of."""
+
+    rows: Any = None
+    low: Any = None
+    high: Any = None
+    unsaid: float = 0.0
+
+    @property
+    def input_limits(self) -> Any:
+        """Return its limits."""
+        return ech.models.Limits(self.rows, self.low, self.high)
+
+    def drift(self, x: jax.Array) -> jax.Array:
+        """Return f."""
+        return super().drift(x).at[2:].add(-self.unsaid * x[2:])
+
+
+@dataclass(frozen=True)
+class Chase:
+    """Carts under stopping points, (N, 4), in steps of dt: held inputs, and paths by the hour."""
+
+    mass: float
+    drag: float
+    L: np.ndarray
+    offsets: np.ndarray
+    numbers: tuple[float, float, float, float, float]
+    wide: float
+    rate: float
+    along: float
+    dt: float
+
+    def path(self, t: float) -> np.ndarray:
+        """Return the leader's place, velocity and acceleration (3, 2): a circle or a line."""
+        if not self.wide:
+            return np.array([[self.along * t, 0.0], [self.along, 0.0], [0.0, 0.0]])
+        w, s, k = self.rate, np.sin(self.rate * t), np.cos(self.rate * t)
+        return self.wide * np.array([[k, s], [-w * s, w * k], [-w * w * k, -w * w * s]])
+
+    def asked(self, t: float, x: np.ndarray) -> np.ndarray:
+        """Return the forces (N, 2)."""
+        root, c, speed, own, own_speed = self.numbers
+        r, v = self.path(t), x[:, 2:]
+        zeta = x[:, :2] - self.offsets[:, :2] + v / root
+
+        def bounded(pull: np.ndarray, most: float) -> np.ndarray:
+            return pull / np.sqrt(1.0 + (pull / most) ** 2)
+
+        led = r[1] + r[2] / root - bounded(own * (zeta[0] - r[0] - r[1] / root), own_speed)
+        rates = led - bounded(c * self.L @ zeta, speed)
+        return self.mass * (root * (rates - v) + self.drag * v + np.array([0.0, 9.81]))
+
+    def fly(self, x: np.ndarray, end: float, plant: Any = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return the forces (steps, N, 2) that are asked for, and the errors (steps, N)."""
+        forces, errors = [], []
+        for k in range(int(end / self.dt)):
+            u = self.asked(k * self.dt, x)
+            forces.append(u)
+            y = x[:, :2] - self.offsets[:, :2]
+            errors.append(np.abs(y - y[0]).max(axis=1))
+            u = u if plant is None else Plant.clip(plant, u)
+            pull = u / self.mass - np.array([0.0, 9.81])
+            for _ in range(20):
+                h, v = self.dt / 20.0, x[:, 2:]
+                half = v + 0.5 * h * (pull - self.drag * v)
+                x = x + h * np.concatenate([half, pull - self.drag * half], axis=1)
+        return np.array(forces), np.array(errors)
+
+
+def limited_chains(rng: np.random.Generator) -> Finding:
+    """Carts under stopping points with limits somewhat below or above of what their flight asks."""
+    N, dt, root = int(rng.integers(3, 6)), float(rng.choice([0.01, 0.05, 0.1])), 2.0
+    root = float(rng.choice([1.0, 2.0, 4.0]))
+    edges = [(int(rng.integers(0, k)), k, float(rng.uniform(0.5, 2.0))) for k in range(1, N)]
+    L = np.zeros((N, N))
+    for i, j, weight in edges:
+        L[i, j] = L[j, i] = -weight
+    L -= np.diag(L.sum(axis=1))
+    heavy = float(L.diagonal()[1:].max())
+    L[0] = 0.0
+    c = float(rng.uniform(0.1, 0.6)) * min(1.0 / (heavy * dt * (1.0 + root * dt)), 2.0)
+    own, speed, own_speed = 0.5, float(rng.uniform(0.3, 3.0)), float(rng.uniform(0.3, 2.0))
+    mass, drag = float(rng.uniform(0.5, 2.0)), float(rng.uniform(0.0, 2.0) * rng.integers(2))
+    unsaid = float(rng.uniform(0.5, 3.0) * (rng.random() < 0.3))
+    offsets = np.zeros((N, 4))
+    offsets[:, :2] = rng.normal(size=(N, 2)) * rng.integers(2)
+    wide = float(rng.uniform(0.3, 2.0) * rng.integers(2))
+    pace, along = float(rng.uniform(0.1, 1.0)), float(rng.uniform(-2.0, 2.0))
+    numbers = root, c, speed, own, own_speed
+    chase = Chase(mass, drag + unsaid, L, offsets, numbers, wide, pace, along, dt)
+    starts = offsets + rng.normal(size=(N, 4)) * [3.0, 3.0, 0.5, 0.5]
+    starts[0] = offsets[0] + np.concatenate(chase.path(0.0)[:2])
+    starts[0] += rng.normal(size=4) * rng.integers(2)
+    end = 8.0 / min(root, c * 0.2) if c > 0.5 else 60.0
+    forces, free = chase.fly(starts, min(end, 60.0))
+    rows = rng.normal(size=(2, 2)) + 2.0 * np.eye(2) if rng.integers(2) else np.eye(2)
+    used = forces @ rows.T
+    low, high, rest = used.min(axis=(0, 1)), used.max(axis=(0, 1)), rows @ [0.0, 9.81 * mass]
+    factor = float(rng.choice([0.999, 1.05, 1.5, 2.0, 3.0, 10.0]))
+    low, high = rest + factor * (low - rest) - 1e-6, rest + factor * (high - rest) + 1e-6
+    if rng.random() < 0.6:
+        high = np.maximum(high, 2.0 * rest - low)
+        low = np.minimum(low, 2.0 * rest - high) if rng.integers(2) else np.full(2, -np.inf)
+    model = Crane(mass, drag, 9.81, rows, low, high, unsaid)
+    shared: dict[str, Any] = {"roots": (root,), "observer": False}
+    zero = {"center": (0.0, 0.0, 0.0), "radius": wide, "rate": pace}
+    reference = ech.references.Circle(**zero) if wide else ech.references.Line(
+        start=(0.0, 0.0, 0.0), velocity=(along, 0.0, 0.0)
+    )  # fmt: skip
+    drive = ech.Laws(
+        ech.laws.StoppingLeader(reference=reference, coupling=own, speed=own_speed, **shared),
+        ech.laws.StoppingPoint(coupling=c, speed=speed, **shared),
+    )
+    try:
+        graph, goals = ech.Graph.from_edges(edges, (0,), N), ech.Formation(offsets)
+        parts = ech.Parts(model, graph, goals, drive, initial=starts)
+        answer = ech.guarantee(parts, ech.Settings(60.0, dt))
+    except ech.EchelonError as error:
+        return silent(str(error))
+    forces, errors = chase.fly(starts, 60.0, model)
+    asked = forces @ rows.T
+    beyond = float(np.maximum(asked - high, low - asked).max() / np.abs(used - rest).max())
+    lost = not errors[-1].max() < 0.05 * max(errors[0].max(), 0.1)
+    false = []
+    if answer.promised and beyond > _CLOSE:
+        what = ", and lost" if lost else ""
+        false = [f"{answer.theorem}: beyond a limit by {beyond} of what is asked{what}"]
+    why = "" if answer.promised else (*answer.reasons, *answer.conditions)[0][:90]
+    return Finding(answer.promised, tuple(false), beyond <= 0.0 and not lost, why)
+
+
+LIMITS: dict[str, Family] = {"limits": limited_inputs, "limits of chains": limited_chains}

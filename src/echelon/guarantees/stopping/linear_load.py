@@ -65,16 +65,17 @@ def _input_slopes(model: ControlAffine, outputs: tuple[str, ...]) -> tuple[Array
         return None
     zero = jnp.zeros((model.flat_order + 2, len(outputs)))
 
-    def asked(y: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def asked(y: jax.Array) -> tuple[jax.Array, ...]:
         (x, u), (rate, _) = jax.jvp(model.flat, (y[:-1],), (y[1:],))
-        return u, jnp.append(model.velocity(x, u) - rate, flat_output(model, outputs, x) - y[0])
+        return u, model.velocity(x, u) - rate, flat_output(model, outputs, x) - y[0]
 
     with precision("float64"):
         slopes = jax.jacfwd(asked)
         if any(used_leaves(slopes, zero)):
             return None
-        (u, off), (T, bent) = (map(np.asarray, part(zero)) for part in (asked, slopes))
-    if np.abs(off).max() + np.abs(bent).max() > _SAME * (1.0 + np.abs(u).max() + np.abs(T).max()):
+        (u, *off), (T, *bent) = (map(np.asarray, part(zero)) for part in (asked, slopes))
+    most = max(float(np.abs(part).max()) for part in (*off, *bent))
+    if not most <= _SAME * (1.0 + np.abs(u).max() + np.abs(T).max()):
         return None
     return u, np.moveaxis(T, 0, 1)[:-1]
 
