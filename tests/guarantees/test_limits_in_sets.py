@@ -122,6 +122,23 @@ def test_inputs_are_bounded_by_the_equations_and_not_by_a_flat_of_others():
     assert promised == [False, True]
 
 
+def test_a_leader_that_holds_its_inputs_asks_for_more_than_its_path():
+    # 16 m/s^2 are the circle's; in steps of 0.1 s the leader asks for 17.7.
+    circle = ech.references.Circle(center=(0.0, 0.0, 0.0), radius=1.0, rate=4.0)
+    shared = {"roots": (4.0,), "observer": False}
+    laws = ech.Laws(
+        ech.laws.StoppingLeader(reference=circle, coupling=4.0, speed=2.5, **shared),
+        ech.laws.StoppingPoint(coupling=1.0, speed=0.01, **shared),
+    )
+    starts, goals = np.array([[1.0, 0.0, 0.0, 4.0]] * 3), ech.Formation(np.zeros((3, 4)))
+    settings, said = ech.Settings(horizon=6.0, dt=0.1), []
+    for most in (16.2, 18.0):
+        parts = ech.Parts(Cart(dimension=2, most=most), GRAPH, goals, laws, initial=starts)
+        said.append(ech.guarantee(parts, settings).promised)
+        assert bool(ech.simulate(parts, settings).saturated.max()) is not said[-1]
+    assert said == [False, True]
+
+
 def test_a_leader_at_its_limit_leaves_no_set_and_a_limit_of_ones_own_no_guarantee():
     class Own(Cart):
         def limit(self, u):

@@ -20,6 +20,7 @@ from echelon.core.rational import float_above
 from echelon.core.statement import Hypothesis, Statement, holds
 from echelon.core.types import Array
 from echelon.core.words import Kind
+from echelon.guarantees.promises.leaders import own_run
 from echelon.guarantees.stopping.chain_response import slices_of
 from echelon.guarantees.stopping.path_bounds import Pieces, pieces_of
 from echelon.guarantees.stopping.stopping_run import StoppingRun
@@ -43,10 +44,18 @@ def linear_limits(run: StoppingRun) -> Statement | None:
     pieces = pieces_of(run.leader, model, run.settings.horizon, chains.outputs, max(chains.degrees))
     if T[0].any() or np.isinf([run.speed(k) for k in range(len(chains.outputs))]).any():
         return None
+    # The path is one of continuous time: a leader that holds its inputs asks for others.
+    leads = list(run.parts.graph.leaders)
+    starts = run.states[leads] - run.parts.formation.offsets[leads]
+    alone = own_run(run.parts, run.settings, starts)
+    if alone is None:
+        return None
+    held = alone.inputs[:, : len(leads)].reshape(-1, len(trim))
     G, low, high = (np.asarray(part, float) for part in limits)
     worst, name = np.inf, ""
     for row, least, most in zip(G, low, high, strict=True):
-        bottom, top = _range_of(run, pieces, trim @ row, np.einsum("kmi,m->ki", T, row))
+        slopes = np.einsum("kmi,m->ki", T, row)
+        bottom, top = _range_of(run, pieces, trim @ row, slopes, held @ row)
         room = min(float(most) - top, bottom - float(least))
         if room < worst:
             worst, name = room, model.input_names[int(np.abs(row).argmax())]
@@ -80,37 +89,44 @@ def _input_slopes(model: ControlAffine, outputs: tuple[str, ...]) -> tuple[Array
     return u, np.moveaxis(T, 0, 1)[:-1]
 
 
-def _range_of(run: StoppingRun, pieces: Pieces, at_rest: float, T: Array) -> tuple[float, float]:
-    """Return between what a row of limits stays, given its slopes T (r + 1, outputs)."""
+def _range_of(
+    run: StoppingRun, pieces: Pieces, at_rest: float, T: Array, held: Array
+) -> tuple[float, float]:
+    """Return between what a row of limits stays, given its slopes T (r + 1, outputs).
+
+    `held` (K,) is what the leaders ask of it in held steps.
+    """
     chains, low, high = run.law.ready.chains, Fraction(float(at_rest)), Fraction(float(at_rest))
-    rows = pieces.between(_ZERO, None)
+    rows, behind = pieces.between(_ZERO, None), _ZERO
     for k, degree in enumerate(chains.degrees):
-        pushes = _pushes(run, k, degree)
+        led, followed = _pushes(run, k, degree)
         for order in range(1, degree + 1):
             slope = Fraction(float(T[order, k])) if order < len(T) else _ZERO
             if not slope:
                 continue
             ends = [slope * end for row in rows for end in (row[order][k].lo, row[order][k].hi)]
-            low += min(ends) - abs(slope) * pushes[order - 1]
-            high += max(ends) + abs(slope) * pushes[order - 1]
-    return -float_above(-low), float_above(high)
+            low += min(ends) - abs(slope) * led[order - 1]
+            high += max(ends) + abs(slope) * led[order - 1]
+            behind += abs(slope) * followed[order - 1]
+    low, high = min(low, Fraction(float(held.min()))), max(high, Fraction(float(held.max())))
+    return -float_above(behind - low), float_above(high + behind)
 
 
-def _pushes(run: StoppingRun, output: int, degree: int) -> list[Fraction]:
-    """Return bounds of how far y', .., y^(r) of an output are off the path, in all time."""
+def _pushes(run: StoppingRun, output: int, degree: int) -> list[list[Fraction]]:
+    """Return bounds of how far y', .., y^(r) of an output are off, in all time.
+
+    The first are of the leaders, off their path, the others of followers, off their leader.
+    """
     graph, chain = run.parts.graph, run.chain(output)
     leaders, followers = list(graph.leaders), list(graph.followers)
     off = run.flat[leaders] - run.ahead
     away = (run.flat - run.flat[list(graph.nearest_leader())])[followers]
-    total = [_ZERO] * degree
+    found = list[list[Fraction]]()
     for starts, speed in ((off, run.own_speed(output)), (away, run.speed(output))):
         sizes = [
             Fraction(float(np.abs(starts[:, j, output]).max())) + _ROUNDED for j in range(1, degree)
         ]
-        most = Fraction(speed)
-        for order in range(degree):
-            if not chain.powers:
-                total[order] += most
-                continue
-            total[order] += max(p.whole.of(order, sizes, most) for p in slices_of(chain))
-    return total
+        most, parts = Fraction(speed), slices_of(chain) if chain.powers else ()
+        each = (max(p.whole.of(order, sizes, most) for p in parts) for order in range(degree))
+        found.append([*each] if parts else [most] * degree)
+    return found
