@@ -65,12 +65,12 @@ class Plant:
 
     def map(self, xp: Any, x: Any) -> Any:
         """Return g of states (..., n), (..., n, m)."""
-        y, G = x / self.D, self.B / self.E
+        y, G = x / self.D, self.B / self.E[None]
         if self.kind == "planar quadrotor":
             tilt, one = y[..., 2], 0.0 * y[..., 2] + 1.0
             lift = xp.stack([0 * one, 0 * one, 0 * one, -xp.sin(tilt), xp.cos(tilt), 0 * one], -1)
             turn = 0.0 * y + self.B[:, 1]
-            return self.D[:, None] * xp.stack([lift, turn], axis=-1) / self.E
+            return self.D[:, None] * xp.stack([lift, turn], axis=-1) / self.E[None]
         factor = 1.0 + 0.3 * xp.sin(y[..., 0]) if self.kind == "varying" else 1.0 + 0.0 * y[..., 0]
         return factor[..., None, None] * (self.D[:, None] * G)
 
