@@ -26,12 +26,16 @@ class Finding:
         false: what contradicts the guarantee, in words.
         holds: whether the system does in truth what could be guaranteed; None if not known.
         why: why nothing was guaranteed.
+        half: the verdict at half of the region of attraction; None if that is not known.
+        local: runs that are lost behind limits, of which a guarantee of small errors says nothing.
     """
 
     guaranteed: bool
     false: tuple[str, ...] = ()
     holds: bool | None = None
     why: str = ""
+    half: str | None = None
+    local: tuple[str, ...] = ()
 
 
 Family = Callable[[np.random.Generator], Finding]

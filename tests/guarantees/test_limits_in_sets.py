@@ -7,10 +7,11 @@ import scipy.linalg
 from in_words import in_words
 
 import echelon as ech
-from echelon.core.statement import Hypothesis
+from echelon.core.statement import NO_LIMIT, Hypothesis
 from echelon.core.words import GuaranteeVerdict
+from echelon.guarantees.promises.promise import promises
 
-SETTINGS = ech.Settings(horizon=4.0, dt=0.01)
+SETTINGS, GRAPH = ech.Settings(horizon=4.0, dt=0.01), ech.Graph.path(3)
 
 
 class Cart(ech.models.DoubleIntegrator):
@@ -67,6 +68,76 @@ def test_no_input_passes_its_limit_from_the_border_of_the_set(directed):
     assert most <= 1.0 + 1e-9
     # On an undirected graph the border is where the first input reaches its limit.
     assert directed or most == pytest.approx(1.0, rel=1e-6)
+
+
+class Clipped(ech.models.DoubleIntegrator):
+    """A limit without `input_limits`."""
+
+    def limit(self, u):
+        return jnp.clip(u, -0.1, 0.1)
+
+
+@pytest.mark.parametrize("kind", [Clipped, Cart])
+def test_a_run_that_a_limit_takes_from_its_goals_is_not_guaranteed(kind):
+    model, graph = kind(dimension=1) if kind is Clipped else Cart(dimension=1, most=0.1), GRAPH
+    parts, gain = parts_of(model, graph)
+    far = parts.replace(initial=parts.formation.offsets + np.array([[0.0, 0], [20, 20], [20, 20]]))
+    result = ech.simulate(far, SETTINGS._replace(horizon=30.0))
+    assert result.saturated.max() == 1.0
+    assert np.ptp(result.states[-1, :, 0]) > 10.0 * np.ptp(result.states[0, :, 0])
+    found = ech.guarantee(far, SETTINGS)
+    assert found.verdict is GuaranteeVerdict.CONDITIONAL and found.conditions == (NO_LIMIT,)
+    # Near the goals nothing acts, where rows say what acts; of other seeds each start counts.
+    near = ech.guarantee(parts, SETTINGS)
+    assert near.promised is (kind is Cart)
+    draws = parts.replace(initial={"x": 1e-2 if kind is Cart else 1.0})
+    seeds = [SETTINGS._replace(seed=k) for k in range(4)]
+    for settings, told in zip(seeds, promises(draws, seeds), strict=True):
+        assert told.conditions == ech.guarantee(draws.replace(), settings).conditions
+
+
+class Dragged(Cart):
+    """A cart in a fluid, of which the inherited `flat` knows nothing."""
+
+    def drift(self, x):
+        return super().drift(x).at[2:].add(-5.0 * x[2:])
+
+
+def test_inputs_are_bounded_by_the_equations_and_not_by_a_flat_of_others():
+    line = ech.references.Line(start=(0.0, 0.0, 0.0), velocity=(1.5, 0.0, 0.0))
+    shared = {"roots": (2.0,), "observer": False}
+    laws = ech.Laws(
+        ech.laws.StoppingLeader(reference=line, speed=0.5, **shared),
+        ech.laws.StoppingPoint(speed=1.0, **shared),
+    )
+    starts = np.array([[0, 0, 1.5, 0], [4, 0, 1.5, 0], [9, 0, 1.5, 0.0]])
+    promised = []
+    for kind in (Dragged, Cart):
+        model = kind(dimension=2, most=8.0)
+        goals = ech.Formation(np.zeros((3, 4)))
+        parts = ech.Parts(model, GRAPH, goals, laws, initial=starts)
+        found = ech.guarantee(parts, SETTINGS)
+        promised.append(found.promised)
+        result = ech.simulate(parts, SETTINGS)
+        assert bool(result.saturated.max()) is (kind is Dragged)
+    assert promised == [False, True]
+
+
+def test_a_leader_that_holds_its_inputs_asks_for_more_than_its_path():
+    # 16 m/s^2 are the circle's; in steps of 0.1 s the leader asks for 17.7.
+    circle = ech.references.Circle(center=(0.0, 0.0, 0.0), radius=1.0, rate=4.0)
+    shared = {"roots": (4.0,), "observer": False}
+    laws = ech.Laws(
+        ech.laws.StoppingLeader(reference=circle, coupling=4.0, speed=2.5, **shared),
+        ech.laws.StoppingPoint(coupling=1.0, speed=0.01, **shared),
+    )
+    starts, goals = np.array([[1.0, 0.0, 0.0, 4.0]] * 3), ech.Formation(np.zeros((3, 4)))
+    settings, said = ech.Settings(horizon=6.0, dt=0.1), []
+    for most in (16.2, 18.0):
+        parts = ech.Parts(Cart(dimension=2, most=most), GRAPH, goals, laws, initial=starts)
+        said.append(ech.guarantee(parts, settings).promised)
+        assert bool(ech.simulate(parts, settings).saturated.max()) is not said[-1]
+    assert said == [False, True]
 
 
 def test_a_leader_at_its_limit_leaves_no_set_and_a_limit_of_ones_own_no_guarantee():

@@ -14,10 +14,11 @@ import scipy.sparse as sp
 from echelon.agents.models.declarations import is_by_user
 from echelon.agents.models.linearization import linearize
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.models.model_check import is_limited
 from echelon.core.digits import about, at_least
 from echelon.core.statement import NO_LIMIT, Hypothesis, Statement, holds, left_to_run, unneeded
 from echelon.core.types import Array
-from echelon.core.words import Kind, Theorem
+from echelon.core.words import Kind, Theorem, Verdict
 from echelon.guarantees.promises.leaders import Leaders, own_run
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.settings import Settings
@@ -47,7 +48,7 @@ def limit_room(
 ) -> LimitRoom:
     """Return in how large a set of a region's metric no input of a follower is at a limit."""
     name, kind = Hypothesis.LIMITS, Kind.PROOF
-    if not settings.limits or parts.model.input_limits is None:
+    if not (settings.limits and is_limited(parts.model)):
         return LimitRoom(np.inf, unneeded(name, kind, "the inputs have no limits"))
     unbounded = _unbounded(parts, leaders, region)
     if unbounded:
@@ -71,6 +72,14 @@ def limit_room(
 
 
 _at_limits = functools.partial(left_to_run, Hypothesis.LIMITS, NO_LIMIT)
+
+
+def from_starts(line: Statement, starts: Statement) -> Statement:
+    """Return the line on limits of a run from its starts: from outside the set one may act."""
+    if line.verdict is not Verdict.HOLDS or not starts.fails:
+        return line
+    text = "the starts are outside the set in which no limit acts"
+    return _at_limits(text, starts.number, starts.number_text, starts.remedy, line.kind)
 
 
 def _unbounded(parts: Parts, leaders: Leaders, region: RegionCertificate) -> str:

@@ -13,6 +13,7 @@ from echelon.core.claim import Claim, ClaimKind, Number, Rounding
 from echelon.core.digits import about, at_most
 from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
+from echelon.core.types import Array
 from echelon.core.words import Kind, Theorem
 from echelon.guarantees.local.local_certificate import local_certificate
 from echelon.guarantees.promises.case import GuaranteeInputs
@@ -20,10 +21,11 @@ from echelon.guarantees.promises.closed_loop import LinearLoop, grounded_slowest
 from echelon.guarantees.promises.frozen_laws import frozen_of
 from echelon.guarantees.promises.hypotheses import hypotheses
 from echelon.guarantees.promises.leaders import leaders_of
-from echelon.guarantees.promises.limits_in_set import held_line, limit_room
+from echelon.guarantees.promises.limits_in_set import from_starts, held_line, limit_room
 from echelon.guarantees.promises.modes import slowest_in_turns, turns_in_words
 from echelon.guarantees.promises.promise import Guarantee, Promises, unknown_in
 from echelon.guarantees.promises.region import (
+    CertifiedSet,
     adjacent_slopes,
     certified_set,
     domain_in_words,
@@ -89,6 +91,18 @@ def _rate(region: RegionCertificate | None) -> str:
     return f"{about(region.rate, 5)} 1/s ({kind}, {theorem})"
 
 
+def _of_starts(
+    parts: Parts,
+    states: Array,
+    region: RegionCertificate | None,
+    certified: CertifiedSet | None,
+    limits: Statement | None,
+) -> list[Statement]:
+    """Return what changes with the starts (N, n): whether they lie in the set, and limits act."""
+    starts = starts_line(parts, states, region, certified)
+    return [starts] if limits is None else [from_starts(limits, starts), starts]
+
+
 # ---- the guarantee -------------------------------------------------------------------------------
 
 
@@ -98,11 +112,13 @@ class MetricPromise(Guarantee):
     """What is guaranteed near the trim, and on a domain where a metric contracts there.
 
     Attributes:
+        limits: in how large a set no limit acts, whatever the starts; None without a region.
         turns: what the leader's heading may do, in words; empty where the law does not turn.
         slowest_turn: the slowest mode in the steady turns of `turns`, 1/s.
     """
 
     case: GuaranteeInputs
+    limits: Statement | None = None
     turns: str = ""
     slowest_turn: float = -math.inf
 
@@ -128,13 +144,13 @@ class MetricPromise(Guarantee):
         lines = list(hypotheses(case))
         region = weaken(parts, region, lines)
         certificate = region.certificate
-        certified = certified_set(parts, settings, leaders, certificate)
+        certified, limits = certified_set(parts, settings, leaders, certificate), None
         if certificate is not None:
-            room = limit_room(parts, settings, leaders, certificate)
-            lines += [room.line, held_line(parts, settings, certificate)]
-            certified = within(certified, room.radius)
+            radius, limits = limit_room(parts, settings, leaders, certificate)
+            lines += [held_line(parts, settings, certificate)]
+            certified = within(certified, radius)
         lines += [region.line, set_line(certificate, certified)]
-        lines += [starts_line(parts, states, certificate, certified)]
+        lines += _of_starts(parts, states, certificate, certified, limits)
         lines += [claims_line(parts, loop, region.relayed)]
         return cls(
             loop=loop,
@@ -145,6 +161,7 @@ class MetricPromise(Guarantee):
             certified=certified,
             domain="" if certificate is None else domain_in_words(parts, certificate),
             case=case,
+            limits=limits,
             turns=turns_in_words(case),
             slowest_turn=max(slowest_in_turns(case).values(), default=-math.inf),
         )
@@ -155,8 +172,9 @@ class MetricPromise(Guarantee):
             states = Starts(prepared.parts).of([each.seed for each in settings])
         for k, each in enumerate(settings):
             lines = dict(self.hypotheses)
-            parts = self.case.parts
-            lines[Hypothesis.STARTS] = starts_line(parts, states[k], self.region, self.certified)
+            own = self.region, self.certified, self.limits
+            changed = _of_starts(self.case.parts, states[k], *own)
+            lines |= {cast(Hypothesis, line.statement): line for line in changed}
             case = self.case._replace(settings=each)
             yield dataclasses.replace(self, hypotheses=MappingProxyType(lines), case=case)
 

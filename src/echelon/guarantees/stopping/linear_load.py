@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from echelon.agents.models.chains import flat_output
 from echelon.agents.models.declarations import is_by_user
 from echelon.agents.models.model import ControlAffine
 from echelon.core.digits import about
@@ -19,31 +20,42 @@ from echelon.core.rational import float_above
 from echelon.core.statement import Hypothesis, Statement, holds
 from echelon.core.types import Array
 from echelon.core.words import Kind
+from echelon.guarantees.promises.leaders import own_run
 from echelon.guarantees.stopping.chain_response import slices_of
 from echelon.guarantees.stopping.path_bounds import Pieces, pieces_of
 from echelon.guarantees.stopping.stopping_run import StoppingRun
 
 _ROUNDED = Fraction(1, 10**6)
 """Of a start in flat coordinates: a thousand times what floats leave of it."""
+_SAME = 1e-9
+"""Relative; what floats leave between `flat` and the equations."""
 _ZERO = Fraction(0)
 
 
 def linear_limits(run: StoppingRun) -> Statement | None:
     """Return that no limit acts from the starts of a run; None where that is not shown."""
     model = run.parts.model
-    limits, slopes = model.input_limits, _input_slopes(model)
+    chains = run.law.ready.chains
+    limits, slopes = model.input_limits, _input_slopes(model, chains.outputs)
     own = is_by_user(model, "limit")
     if limits is None or slopes is None or own or run.parts.formation.motion is not None:
         return None
     trim, T = slopes
-    chains = run.law.ready.chains
     pieces = pieces_of(run.leader, model, run.settings.horizon, chains.outputs, max(chains.degrees))
     if T[0].any() or np.isinf([run.speed(k) for k in range(len(chains.outputs))]).any():
         return None
+    # The path is one of continuous time: a leader that holds its inputs asks for others.
+    leads = list(run.parts.graph.leaders)
+    starts = run.states[leads] - run.parts.formation.offsets[leads]
+    alone = own_run(run.parts, run.settings, starts)
+    if alone is None:
+        return None
+    held = alone.inputs[:, : len(leads)].reshape(-1, len(trim))
     G, low, high = (np.asarray(part, float) for part in limits)
     worst, name = np.inf, ""
     for row, least, most in zip(G, low, high, strict=True):
-        bottom, top = _range_of(run, pieces, trim @ row, np.einsum("kmi,m->ki", T, row))
+        slopes = np.einsum("kmi,m->ki", T, row)
+        bottom, top = _range_of(run, pieces, trim @ row, slopes, held @ row)
         room = min(float(most) - top, bottom - float(least))
         if room < worst:
             worst, name = room, model.input_names[int(np.abs(row).argmax())]
@@ -53,54 +65,68 @@ def linear_limits(run: StoppingRun) -> Statement | None:
     return holds(Hypothesis.LIMITS, Kind.PROOF, text, worst, f"{about(worst)} left")
 
 
-def _input_slopes(model: ControlAffine) -> tuple[Array, Array] | None:
-    """Return u_0 (m,) and T (r + 1, m, outputs); None of an input that is not linear in them."""
-    if not model.flat_outputs:
-        return None
-    shape = model.flat_order + 1, len(model.flat_outputs)
+def _input_slopes(model: ControlAffine, outputs: tuple[str, ...]) -> tuple[Array, Array] | None:
+    """Return u_0 (m,) and T (r + 1, m, outputs); None of an input that is not linear in them.
 
-    def asked(derivatives: jax.Array) -> jax.Array:
-        return model.flat(derivatives)[1]
+    Laws invert the equations: a `flat` that agrees with them in linear terms alone is used.
+    """
+    if tuple(model.flat_outputs) != outputs:
+        return None
+    zero = jnp.zeros((model.flat_order + 2, len(outputs)))
+
+    def asked(y: jax.Array) -> tuple[jax.Array, ...]:
+        (x, u), (rate, _) = jax.jvp(model.flat, (y[:-1],), (y[1:],))
+        return u, model.velocity(x, u) - rate, flat_output(model, outputs, x) - y[0]
 
     with precision("float64"):
-        slope = jax.jacfwd(asked)
-        if any(used_leaves(slope, jnp.zeros(shape))):
+        slopes = jax.jacfwd(asked)
+        if any(used_leaves(slopes, zero)):
             return None
-        T, u = np.asarray(slope(jnp.zeros(shape))), np.asarray(asked(jnp.zeros(shape)))
-    return u, np.moveaxis(T, 0, 1)
+        (u, *off), (T, *bent) = (map(np.asarray, part(zero)) for part in (asked, slopes))
+    most = max(float(np.abs(part).max()) for part in (*off, *bent))
+    if not most <= _SAME * (1.0 + np.abs(u).max() + np.abs(T).max()):
+        return None
+    return u, np.moveaxis(T, 0, 1)[:-1]
 
 
-def _range_of(run: StoppingRun, pieces: Pieces, at_rest: float, T: Array) -> tuple[float, float]:
-    """Return between what a row of limits stays, given its slopes T (r + 1, outputs)."""
+def _range_of(
+    run: StoppingRun, pieces: Pieces, at_rest: float, T: Array, held: Array
+) -> tuple[float, float]:
+    """Return between what a row of limits stays, given its slopes T (r + 1, outputs).
+
+    `held` (K,) is what the leaders ask of it in held steps.
+    """
     chains, low, high = run.law.ready.chains, Fraction(float(at_rest)), Fraction(float(at_rest))
-    rows = pieces.between(_ZERO, None)
+    rows, behind = pieces.between(_ZERO, None), _ZERO
     for k, degree in enumerate(chains.degrees):
-        pushes = _pushes(run, k, degree)
+        led, followed = _pushes(run, k, degree)
         for order in range(1, degree + 1):
             slope = Fraction(float(T[order, k])) if order < len(T) else _ZERO
             if not slope:
                 continue
             ends = [slope * end for row in rows for end in (row[order][k].lo, row[order][k].hi)]
-            low += min(ends) - abs(slope) * pushes[order - 1]
-            high += max(ends) + abs(slope) * pushes[order - 1]
-    return -float_above(-low), float_above(high)
+            low += min(ends) - abs(slope) * led[order - 1]
+            high += max(ends) + abs(slope) * led[order - 1]
+            behind += abs(slope) * followed[order - 1]
+    low, high = min(low, Fraction(float(held.min()))), max(high, Fraction(float(held.max())))
+    return -float_above(behind - low), float_above(high + behind)
 
 
-def _pushes(run: StoppingRun, output: int, degree: int) -> list[Fraction]:
-    """Return bounds of how far y', .., y^(r) of an output are off the path, in all time."""
+def _pushes(run: StoppingRun, output: int, degree: int) -> list[list[Fraction]]:
+    """Return bounds of how far y', .., y^(r) of an output are off, in all time.
+
+    The first are of the leaders, off their path, the others of followers, off their leader.
+    """
     graph, chain = run.parts.graph, run.chain(output)
     leaders, followers = list(graph.leaders), list(graph.followers)
     off = run.flat[leaders] - run.ahead
     away = (run.flat - run.flat[list(graph.nearest_leader())])[followers]
-    total = [_ZERO] * degree
+    found = list[list[Fraction]]()
     for starts, speed in ((off, run.own_speed(output)), (away, run.speed(output))):
         sizes = [
             Fraction(float(np.abs(starts[:, j, output]).max())) + _ROUNDED for j in range(1, degree)
         ]
-        most = Fraction(speed)
-        for order in range(degree):
-            if not chain.powers:
-                total[order] += most
-                continue
-            total[order] += max(p.whole.of(order, sizes, most) for p in slices_of(chain))
-    return total
+        most, parts = Fraction(speed), slices_of(chain) if chain.powers else ()
+        each = (max(p.whole.of(order, sizes, most) for p in parts) for order in range(degree))
+        found.append([*each] if parts else [most] * degree)
+    return found
