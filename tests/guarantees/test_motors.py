@@ -185,7 +185,7 @@ def test_motors_that_suffice_are_promised_and_verified(hovering, tmp_path):
     # What is no part of a tube needs the scenario.
     assert check().verdict == "incomplete", check().sentence
     open_ = [x.claim for x in check().findings if x.open]
-    assert open_ == [f"promise.{key}" for key in told]
+    assert open_ == [f"guarantee.{key}" for key in told]
     motors = told["anywhere"]["motors"]
     for place, key, factor in (
         (motors, "least", 1.02),

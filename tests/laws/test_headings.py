@@ -262,7 +262,8 @@ def test_inputs_are_the_trim_and_the_scale_times_normalized_ones(name):
 
 def test_law_json_names_no_message_as_an_input():
     model, settings = MODELS["point"], ech.Settings(horizon=1.0, dt=0.01)
-    files = python_law(under("consensus", model), settings, 1, "", "")
+    stated = ech.guarantee(under("consensus", model), settings).as_mapping()
+    files = python_law(under("consensus", model), settings, 1, "", stated)
     facts = json.loads(files["law.json"])
     assert facts["message"] == ["normalized speed", "normalized turn_rate", "heading"]
     assert "no physical inputs u" in facts["message_meaning"]

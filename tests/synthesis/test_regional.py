@@ -319,7 +319,7 @@ def test_a_weak_input_weakens_the_trim_thrust_too():
 
 def test_check_exits_by_what_is_promised_and_by_a_missing_solver(echelon, monkeypatch):
     code, out, err = echelon("check", "paper")
-    assert (code, err) == (0, "") and "Local guarantee (linearization)" in out
+    assert (code, err) == (0, "") and "Guaranteed (linearization)" in out
     code, out, _ = echelon("check", "paper-literal", "--json")
     assert code == 1 and json.loads(out)["guarantee"]["verdict"] == "none"
     monkeypatch.setitem(sys.modules, "cvxpy", None)

@@ -65,8 +65,8 @@ _ROUNDING = Decimal("1e-8")
 """Printed numbers below it are mostly rounding of the run, which differs between processors."""
 _GROWN = "the run computed again differs, perhaps by rounding, which may grow where errors do"
 _MOVED, _TIMES, _UNLIKE = 1e-12, 30.0, 0.1
-"""How far starts are moved to see how rounding grows, by what factor two processors may differ more,
-and from which relative difference on runs are not compared."""
+"""How far starts are moved to see how rounding grows, by what factor two processors may differ
+more, and from which relative difference on runs are not compared."""
 _SETTLED = {"graph spectrum": "graph.spectrum", "method": "method"}
 """What independent code leaves open of large and switching graphs and own methods, and what the
 scenario settles it by."""

@@ -97,8 +97,8 @@ def guarantee_rows(data: JsonObject) -> Iterator[Row]:
     yield from _labelled("note", _notes(data))
     until = data.get("until")
     if until is not None:
-        text = f"{at_most(until['at'], 6)} s: {heading(until['guarantee'])}"
-        yield "until", text[0].lower() + text[1:]
+        head = heading(until["guarantee"])
+        yield "until", f"{at_most(until['at'], 6)} s: {head[0].lower()}{head[1:]}"
         yield from (row for row in guarantee_rows(until["guarantee"]))
 
 
@@ -184,8 +184,7 @@ def _rates(data: JsonObject) -> Iterator[Row]:
             yield "", f"{shown(data, 'quick_rate')} while {age}" if quick else age
     if "rate_alone" in numbers:
         yield "rate", f"{shown(data, 'rate_alone')} eventually, where nobody is held back"
-    near = number_in(data, "coupling") is not None and not everywhere and slow is not None
-    if near and slow is not None and data["claim"] != str(ClaimKind.APART):
+    if number_in(data, "coupling") is not None and not data["theorem"] and slow is not None:
         above = f"; any above {shown(data, 'edge', 4)} suffices" if "edge" in numbers else ""
         mode = "" if rate and abs(rate + slow) <= 1e-6 * rate else _mode(slow)
         yield "coupling", f"{shown(data, 'coupling', 4)}{above}{mode}"
