@@ -103,6 +103,7 @@ class Dragged(Cart):
         return super().drift(x).at[2:].add(-5.0 * x[2:])
 
 
+@pytest.mark.slow
 def test_inputs_are_bounded_by_the_equations_and_not_by_a_flat_of_others():
     line = ech.references.Line(start=(0.0, 0.0, 0.0), velocity=(1.5, 0.0, 0.0))
     shared = {"roots": (2.0,), "observer": False}
@@ -123,6 +124,7 @@ def test_inputs_are_bounded_by_the_equations_and_not_by_a_flat_of_others():
     assert promised == [False, True]
 
 
+@pytest.mark.slow
 def test_a_leader_that_holds_its_inputs_asks_for_more_than_its_path():
     # 16 m/s^2 are the circle's; in steps of 0.1 s the leader asks for 17.7.
     circle = ech.references.Circle(center=(0.0, 0.0, 0.0), radius=1.0, rate=4.0)
@@ -184,6 +186,7 @@ def test_held_inputs_may_raise_what_falls_in_continuous_time():
         assert falls or found.conditions == ("inputs act at every instant",)
 
 
+@pytest.mark.slow
 def test_a_linear_chain_keeps_its_limits_in_the_tube():
     graph = ech.Graph.path(3)
     circle = ech.references.Circle(radius=0.5, rate=0.2)

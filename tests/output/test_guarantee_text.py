@@ -20,7 +20,7 @@ from echelon.output.reports.guarantee_text import (
 from echelon.output.reports.run_report import print_screen
 
 WORDS, COLUMNS, LINES = 25, 80, 24
-QUICK = ("paper", "integrators", "unicycle", "van-der-pol", "leader-lost")
+QUICK = ("paper", "integrators", "unicycle", "van-der-pol")
 LATER = sorted({*bundled_scenarios()} - {*QUICK})
 
 

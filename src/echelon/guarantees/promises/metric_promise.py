@@ -146,6 +146,8 @@ class MetricPromise(Guarantee):
         certificate = region.certificate
         certified, limits = certified_set(parts, settings, leaders, certificate), None
         if certificate is not None:
+            # A region says itself where the leader may go.
+            lines = [line for line in lines if line.statement is not Hypothesis.LEADER]
             radius, limits = limit_room(parts, settings, leaders, certificate)
             lines += [held_line(parts, settings, certificate)]
             certified = within(certified, radius)
@@ -218,28 +220,31 @@ class MetricPromise(Guarantee):
 
     def claim(self) -> Claim:
         """Return what is claimed near the trim, and what the region adds."""
-        region, close = self.region, "starts close to the goals; how close is not known"
+        region, close = self.region, "starts close to the goals"
         premises = () if self.case.matched else ("the leader's input rests at its trim",)
-        numbers = {}
-        if region is None:
-            if Hypothesis.LEADER not in self.hypotheses:
-                premises = (f"the leader stays close to the trim{self.turns}", *premises)
-            return Claim(ClaimKind.CONVERGES, (close,), premises=premises)
-        what = ClaimKind.BOUNDED if region.theorem is Theorem.A5 else ClaimKind.CONVERGES
-        certified = self.certified
-        if certified is None:
+        if region is not None and self.certified is not None:
+            return self._of_set(region, self.certified, premises)
+        if region is not None:
             premises = (f"the leader stays in {self.domain}", *premises)
-            return Claim(what, ("starts close to the goals",), premises=premises)
+            return Claim(ClaimKind.CONVERGES, (close,), premises=premises)
+        if Hypothesis.LEADER not in self.hypotheses:
+            premises = (f"the leader stays close to the trim{self.turns}", *premises)
+        return Claim(ClaimKind.CONVERGES, (f"{close}; how close is not known",), premises=premises)
+
+    def _of_set(
+        self, region: RegionCertificate, certified: CertifiedSet, premises: tuple[str, ...]
+    ) -> Claim:
+        what = ClaimKind.BOUNDED if region.theorem is Theorem.A5 else ClaimKind.CONVERGES
         if not certified.radius:
             start = (f"any, for as long as all agents stay in {self.domain}",)
             notes = (f"no start is certified to stay: {certified.why}", certified.remedy)
             return Claim(what, start, premises=premises, notes=notes)
         if certified.kind is not self.kind:
             premises = ("the leader moves as in a run of its own", *premises)
-        start = "everywhere"
-        if math.isfinite(certified.radius):
-            numbers = {"set_radius": Number(certified.radius, "", Rounding.DOWN)}
-            start = f"sum_i delta_i'P delta_i <= {at_most(certified.radius)}^2"
+        if math.isinf(certified.radius):
+            return Claim(what, ("everywhere",), premises=premises)
+        numbers = {"set_radius": Number(certified.radius, "", Rounding.DOWN)}
+        start = f"sum_i delta_i'P delta_i <= {at_most(certified.radius)}^2"
         return Claim(what, (start,), premises=premises, numbers=numbers)
 
     def why_covered(self) -> str:

@@ -34,35 +34,39 @@ _ZERO = Fraction(0)
 
 def linear_limits(run: StoppingRun) -> Statement | None:
     """Return that no limit acts from the starts of a run; None where that is not shown."""
-    model = run.parts.model
-    chains = run.law.ready.chains
+    model, chains = run.parts.model, run.law.ready.chains
     limits, slopes = model.input_limits, _input_slopes(model, chains.outputs)
-    own = is_by_user(model, "limit")
-    if limits is None or slopes is None or own or run.parts.formation.motion is not None:
+    other = is_by_user(model, "limit") or run.parts.formation.motion is not None
+    if limits is None or slopes is None or other:
         return None
-    trim, T = slopes
+    (trim, T), held = slopes, _held_inputs(run)
+    fastest = max(run.speed(k) for k in range(len(chains.outputs)))
+    if held is None or T[0].any() or np.isinf(fastest):
+        return None
     pieces = pieces_of(run.leader, model, run.settings.horizon, chains.outputs, max(chains.degrees))
-    if T[0].any() or np.isinf([run.speed(k) for k in range(len(chains.outputs))]).any():
+    rooms = list[tuple[float, str]]()
+    for row, least, most in zip(*(np.asarray(part, float) for part in limits), strict=True):
+        bottom, top = _range_of(run, pieces, trim @ row, np.einsum("kmi,m->ki", T, row), held @ row)
+        room = min(float(most) - top, bottom - float(least))
+        rooms.append((room, model.input_names[int(np.abs(row).argmax())]))
+    worst, name = min(rooms, default=(np.inf, ""))
+    if not worst > 0.0:
         return None
-    # The path is one of continuous time: a leader that holds its inputs asks for others.
+    text = f"no limit acts from these starts; `{name}` keeps {about(worst)} of its unit"
+    return holds(Hypothesis.LIMITS, Kind.PROOF, text, worst, f"{about(worst)} left")
+
+
+def _held_inputs(run: StoppingRun) -> Array | None:
+    """Return what leaders that run alone ask for in held steps, (T L, m); None where they diverge.
+
+    The path is one of continuous time: a leader that holds its inputs asks for others.
+    """
     leads = list(run.parts.graph.leaders)
     starts = run.states[leads] - run.parts.formation.offsets[leads]
     alone = own_run(run.parts, run.settings, starts)
     if alone is None:
         return None
-    held = alone.inputs[:, : len(leads)].reshape(-1, len(trim))
-    G, low, high = (np.asarray(part, float) for part in limits)
-    worst, name = np.inf, ""
-    for row, least, most in zip(G, low, high, strict=True):
-        slopes = np.einsum("kmi,m->ki", T, row)
-        bottom, top = _range_of(run, pieces, trim @ row, slopes, held @ row)
-        room = min(float(most) - top, bottom - float(least))
-        if room < worst:
-            worst, name = room, model.input_names[int(np.abs(row).argmax())]
-    if not worst > 0.0:
-        return None
-    text = f"no limit acts from these starts; `{name}` keeps {about(worst)} of its unit"
-    return holds(Hypothesis.LIMITS, Kind.PROOF, text, worst, f"{about(worst)} left")
+    return alone.inputs[:, : len(leads)].reshape(-1, alone.inputs.shape[-1])
 
 
 def _input_slopes(model: ControlAffine, outputs: tuple[str, ...]) -> tuple[Array, Array] | None:

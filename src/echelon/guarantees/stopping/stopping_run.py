@@ -450,27 +450,30 @@ def _step_line(run: StoppingRun) -> Statement:
     """Return whether a held step keeps the largest stopping point from growing, c d_max dt <= 1."""
     name, dt, c = Hypothesis.SAMPLING, run.settings.dt, run.coupling
     share, own = c * run.heaviest * dt, float(run.leader.strength(dt))
-    radius = _step_radius(run, run.law.ready, c * _strengths(run))
-    radius = max(radius, _step_radius(run, run.leader.ready, np.array([own])))
-    share_text, own = f"c d_max dt = {at_least(share)}", own * dt
-    if own > 1.0 + 1e-12:
+    loops = (run.law.ready, c * _strengths(run)), (run.leader.ready, np.array([own]))
+    radius = max(_step_radius(run, *loop) for loop in loops)
+    share_text = f"c d_max dt = {at_least(share)}"
+    if own * dt > 1.0 + 1e-12:
         # Its distance from its path would grow, on which the tube and the motors rest.
+        own, remedy = own * dt, f"lower `leader.coupling` to {at_most(1.0 / dt, 4)}"
         text = f"the leader's step `dt` = {dt:g} s is too long: c dt = {at_least(own)} is above 1"
-        remedy = f"lower `leader.coupling` to {at_most(1.0 / dt, 4)}"
-        return fails(
-            name, Kind.LINEARIZATION, text, own, share_text, 1.0, remedy=remedy, reason=text
-        )
+        return _too_long(text, (own, share_text), remedy)
     if share <= 1.0 + 1e-12 and radius < 1.0:
         text = f"Euler's step of zeta does not grow; spectral radius {at_least(radius, 4)} a step"
         return holds(name, Kind.LINEARIZATION, text, share, share_text, 1.0)
+    if share <= 1.0:
+        text = f"the step `dt` = {dt:g} s is too long: spectral radius {at_least(radius, 4)}"
+        remedy = "lower `coupling` or `roots`, or shorten `simulation.dt`"
+        return _too_long(text, (share, share_text), remedy)
     text = f"the step `dt` = {dt:g} s is too long: c d_max dt = {at_least(share)} is above 1"
     remedy = f"lower `coupling` to {at_most(1.0 / (run.heaviest * dt), 4)}, or shorten "
     remedy += f"`simulation.dt` to {at_most(1.0 / (c * run.heaviest))} s"
-    if share <= 1.0:
-        text = f"the step `dt` = {dt:g} s is too long for this coupling and these roots: spectral "
-        text += f"radius {at_least(radius, 4)}"
-        remedy = "lower `coupling` or `roots`, or shorten `simulation.dt`"
-    return fails(name, Kind.LINEARIZATION, text, share, share_text, 1.0, remedy=remedy, reason=text)
+    return _too_long(text, (share, share_text), remedy)
+
+
+def _too_long(text: str, number: tuple[float, str], remedy: str) -> Statement:
+    name, kind = Hypothesis.SAMPLING, Kind.LINEARIZATION
+    return fails(name, kind, text, *number, 1.0, remedy=remedy, reason=text)
 
 
 def _step_radius(run: StoppingRun, loop: FlatLoop, strengths: Array) -> float:

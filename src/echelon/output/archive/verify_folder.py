@@ -149,22 +149,30 @@ def compare_run(
         return
     result = dataclasses.replace(result, **origin_of(scenario))
     yield from compare_structure(files.data, run_file(result))
-    laws = isinstance(result.parts.drive, Laws)
-    digits = _PRECISIONS[result.settings.precision] if laws else _SOLVED
-    findings = [*_compare(files, data, result, digits)]
-    differ = any(map(_differs, findings))
-    if not differ or guarantee(*experiment).promised and _converged(result):
-        yield from findings
-        return
-    wider = _digits_left(experiment, result, digits)
-    refused = set[str]()
-    if wider is not None:
-        stored = load(files.data.parent, experiment.parts)
-        again = _compare(files, data, result, wider, stored)
-        refused = {finding.claim for finding in again if _differs(finding)}
+    findings = [*_compare(files, data, result, _digits_of(result))]
+    refused = {finding.claim for finding in findings if _differs(finding)}
+    if refused and not (guarantee(*experiment).promised and _converged(result)):
+        refused = _beyond_rounding(files, data, experiment, result)
     for finding in findings:
         open_ = _differs(finding) and finding.claim not in refused
         yield unchecked(finding.claim, finding.stored, _GROWN) if open_ else finding
+
+
+def _digits_of(result: Result) -> Digits:
+    laws = isinstance(result.parts.drive, Laws)
+    return _PRECISIONS[result.settings.precision] if laws else _SOLVED
+
+
+def _beyond_rounding(
+    files: ClaimFiles, data: Labelled, experiment: Experiment, result: Result
+) -> set[str]:
+    """Return the claims that differ by more than rounding may have grown to."""
+    wider = _digits_left(experiment, result, _digits_of(result))
+    if wider is None or files.data is None:
+        return set()
+    stored = load(files.data.parent, experiment.parts)
+    again = _compare(files, data, result, wider, stored)
+    return {finding.claim for finding in again if _differs(finding)}
 
 
 def _differs(finding: ClaimCheck) -> bool:

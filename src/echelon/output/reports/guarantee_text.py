@@ -165,7 +165,7 @@ def _numbers(data: JsonObject) -> Iterator[Row]:
         if lost:
             yield "", f"in all but one run in a million no link loses more than {lost} in a row"
         if "delay" in numbers:
-            yield "", f"they cost a delay of {shown(data, 'delay')} at most"
+            yield "", f"late ones cost a delay of {shown(data, 'delay')} at most"
     if "motor_least" in numbers:
         text = f"{shown(data, 'motor_least')} to {shown(data, 'motor_largest', 4)}, of "
         text += f"{shown(data, 'motor_limit', 4)}; tilt {shown(data, 'tilt')} at most"

@@ -128,9 +128,11 @@ def print_report(console: "Console", result: Result, numbers: Metrics) -> None:
         say(console, sentence)
 
 
-def print_guarantee(console: "Console", stated: Guarantee | JsonObject) -> None:
+def print_guarantee(
+    console: "Console", stated: Guarantee | JsonObject, brief: bool = False
+) -> None:
     """Print a guarantee, each row on one line where the output is no terminal."""
-    for line in guarantee_lines(stated, _width(console)):
+    for line in guarantee_lines(stated, _width(console), brief):
         console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
@@ -155,8 +157,13 @@ def print_screen(console: "Console", result: Result, numbers: Metrics) -> None:
     complete = result.outcome is Outcome.COMPLETED and len(outcome) > 1
     for sentence in outcome[complete:]:
         say(console, sentence)
-    for line in guarantee_lines(stated, _width(console), brief=True):
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+    print_guarantee(console, stated, brief=True)
+    for sentence in _told(result, numbers, stated):
+        say(console, sentence)
+
+
+def _told(result: Result, numbers: Metrics, stated: Guarantee) -> Iterator[str]:
+    """Yield a few sentences on what was observed, and all warnings."""
     seen = (
         *observations(result, numbers, stated),
         *coverage(result, stated),
@@ -167,9 +174,8 @@ def print_screen(console: "Console", result: Result, numbers: Metrics) -> None:
     )
     warnings = [text for text in seen if text.startswith(_WARNING)]
     others = [text for text in seen if not text.startswith(_WARNING)]
-    told = [*others[:OBSERVED], *warnings, *(f"{_WARNING}{text}" for text in result.warnings)]
-    for sentence in told:
-        say(console, sentence)
+    yield from (*others[:OBSERVED], *warnings)
+    yield from (f"{_WARNING}{text}" for text in result.warnings)
 
 
 def say(console: "Console", sentence: str) -> None:
