@@ -141,6 +141,12 @@ class Statement:
         return "" if named is None else _UNITS[named["unit"]]
 
     @property
+    def shown_verdict(self) -> str:
+        """The verdict as tables have it: what fails and is no condition of a guarantee is a note."""
+        noted = self.fails and not isinstance(self.statement, Hypothesis)
+        return "note" if noted else str(self.verdict)
+
+    @property
     def explanation(self) -> str:
         """What was found and what would be needed."""
         return f"{self.text}; {self.remedy}" if self.remedy else self.text

@@ -154,7 +154,7 @@ def print_statements(groups: "Mapping[str, Iterable[Statement]]", sentences: Ite
         out.print(sentence, highlight=False, markup=False, soft_wrap=flat)
     heads = ("statement", "verdict", "kind", "number", "reason, or what to change")
     for title, lines in groups.items():
-        rows = ((x.name, str(x.verdict), str(x.kind), x.number_text, x.explanation) for x in lines)
+        rows = ((x.name, x.shown_verdict, str(x.kind), x.number_text, x.explanation) for x in lines)
         out.print(f"\n{title}:", highlight=False, markup=False)
         out.print(plain_table(heads, rows), soft_wrap=flat)
 

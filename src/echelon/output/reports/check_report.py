@@ -19,7 +19,7 @@ _PAPERS = {
 }
 _RESTS = "what a guarantee rests on"
 _LOOP = "leader, links and margins of this loop"
-_PRINTED = "the paper's printed claims; the guarantee does not need those that fail"
+_PRINTED = "the paper's printed claims; a note is one that does not hold, and is not needed"
 
 
 def grouped(lines: Sequence[Statement]) -> dict[str, list[Statement]]:
@@ -92,7 +92,7 @@ def _listed(lines: list[Statement], detail: _Detail) -> Iterator[str]:
 
 def _row(line: Statement, width: int, short: bool, brief: bool) -> Iterator[str]:
     """With `short` a text in place of the number has one row."""
-    head = f" {line.name:{width}}  {line.verdict!s:5}  "
+    head = f" {line.name:{width}}  {line.shown_verdict:5}  "
     text = line.number_text or (line.text if line.fails else "")
     text = textwrap.shorten(text, WIDTH - len(head), placeholder=" ...") if short else text
     yield from _wrapped(text, head, " " * len(head)) or [head.rstrip()]
