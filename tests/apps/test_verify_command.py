@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 
 import h5netcdf
@@ -180,6 +181,13 @@ def link(folder):
     os.symlink(folder.parent / "other" / "gain.json", folder / "gain.json")
 
 
+def last_digit(folder):
+    text = (folder / "report.txt").read_text()
+    found = re.search(r"\d\.\d{3}(?!\d|e)", text)
+    other = f"{found[0][:-1]}{(int(found[0][-1]) + 1) if found[0][-1] != '9' else 8}"
+    (folder / "report.txt").write_text(text.replace(found[0], other, 1))
+
+
 def weaken(document):
     document["coupling"] *= 1e-6
     document["anywhere"] = {"format": "echelon tube 1", "borders": []}
@@ -277,7 +285,7 @@ FORGED = {
     },
     ("gain", OPEN): {
         "no data": lambda folder: (folder / "run.nc").unlink(),
-        "a last digit of a report": in_text("report.txt", "0.2", "0.1"),
+        "a last digit of a report": last_digit,
     },
     ("tube", REFUSED): {
         "a longer number": in_tube('"agents": 4', '"agents": 4' + "0" * 40),

@@ -142,7 +142,7 @@ class Statement:
 
     @property
     def shown_verdict(self) -> str:
-        """The verdict as tables have it: what fails and is no condition of a guarantee is a note."""
+        """The verdict of a table: what fails and is no condition of a guarantee is a note."""
         noted = self.fails and not isinstance(self.statement, Hypothesis)
         return "note" if noted else str(self.verdict)
 

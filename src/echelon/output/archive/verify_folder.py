@@ -61,8 +61,9 @@ _SOLVED = Digits(1e-3, 1e-4)
 """To what two solvers agree on its plans."""
 _STOPPED = (Outcome.INTERRUPTED.name.lower(), Outcome.STOPPED.name.lower())
 _NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e[-+]?\d+)?")
-_ROUNDING = Decimal("1e-8")
-"""Printed numbers below it are mostly rounding of the run, which differs between processors."""
+_ROUNDING, _LAST = Decimal("1e-8"), Decimal("0.12")
+"""Printed numbers below it are mostly rounding of the run, which differs between processors; and
+how much of a number its last digit may be."""
 _GROWN = "the run computed again differs, perhaps by rounding, which may grow where errors do"
 _MOVED, _TIMES, _UNLIKE = 1e-12, 30.0, 0.1
 """How far starts are moved to see how rounding grows, by what factor two processors may differ
@@ -281,6 +282,8 @@ def _near(pair: tuple[str, str]) -> bool:
     """Tell whether two printed numbers differ by one in the last digit, or are rounding both."""
     one, other = map(Decimal, pair)
     digit = Decimal((0, (1,), max(int(x.as_tuple().exponent) for x in (one, other))))
+    # Of a number with one digit the last one is all of it.
+    digit = min(digit, _LAST * max(one, other))
     return abs(one - other) <= digit or max(one, other) < _ROUNDING
 
 
