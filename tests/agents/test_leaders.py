@@ -40,7 +40,7 @@ def test_each_leader_has_its_row_with_its_own_numbers(flown):
         assert each.rmse == pytest.approx(wanted, rel=1e-9)
     # The first starts off its circle, the others do not.
     assert leaders[0].rmse > 10.0 * leaders[1].rmse
-    rows = re.findall(r"^ (leader \d+) +(\S+)", ech.report(flown), re.MULTILINE)
+    rows = re.findall(r"^(leader \d+) +(\S+)", ech.report(flown), re.MULTILINE)
     assert rows == [(f"leader {each.agent}", f"{each.rmse:.4g}") for each in leaders]
     told = ech.summary(flown)["leaders"]
     assert [each["rmse"] for each in told] == [each.rmse for each in leaders]

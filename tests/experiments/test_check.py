@@ -244,7 +244,7 @@ def test_what_a_gain_says_of_itself_is_not_believed_but_compared(robust, changes
     assert (found.theorem, found.kind, found.rate) == (true.theorem, true.kind, true.rate)
     told = [key for key in changes if key != "hull"]
     assert found.hypotheses[Hypothesis.CLAIMS].fails is bool(told)
-    assert "note the gain says" in in_words(found) and "note" not in in_words(true)
+    assert "but the gain says" in in_words(found) and " but " not in in_words(true)
 
 
 def test_where_only_the_drift_is_known_the_set_pays_for_the_graph_if_g_varies(robust):

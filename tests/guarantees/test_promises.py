@@ -170,7 +170,7 @@ def test_a_gain_of_another_graph_or_coupling_is_promised_what_it_does():
     assert found.loop.slowest == pytest.approx(slowest, rel=1e-6)
     low = path.spectrum().low
     assert found.edge == pytest.approx(0.5 / low, rel=1e-9)
-    note = f"note the gain was made for lambda_min 1, and this graph has {low:.4g}"
+    note = f"but the gain was made for lambda_min 1, and this graph has {low:.4g}"
     assert note in in_words(found)
     report = " ".join(ech.report(ech.simulate(parts, settings(horizon=0.02))).split())
     assert in_words(found) in report

@@ -226,7 +226,7 @@ def test_the_law_says_what_it_needs_and_by_how_much_a_branch_amplifies():
     step = np.array([[1.0, dt], [0.0, 1.0]]) - np.outer([0.5 * dt**2, dt], [1.0, 3.0**0.5])
     rate = -np.log(np.abs(np.linalg.eigvals(step)).max()) / dt
     text = " ".join(report(run).split())
-    said = f"decays at {at_most(rate)} 1/s (coupling 1). Couplings above 0.5 are sufficient"
+    said = f"rate {at_most(rate)} 1/s eventually coupling 1; any above 0.5 suffices"
     assert said in text and rate == pytest.approx(3.0**0.5 / 2.0, rel=dt)
     assert "follower: neighbours' states; its parent's input of the same step." in text
 

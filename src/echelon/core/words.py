@@ -87,7 +87,7 @@ moves, which is seldom what is meant; the paper's own network is `none`."""
 
 
 class Kind(Word):
-    """The kind of an argument, and how a promise that rests on it begins; the strongest first."""
+    """The kind of an argument, the strongest first."""
 
     PROOF = "Proved in exact arithmetic, in continuous time"
     VERTICES = "By eigenvalues at the corners of a hull of all Jacobians, in continuous time"

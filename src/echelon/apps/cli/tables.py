@@ -173,7 +173,7 @@ def plain_table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> "Table
 
 
 def foretell(experiment: "Experiment", quiet: bool) -> None:
-    """Print the warnings of a run, and its guarantee on a terminal or if nothing is guaranteed."""
+    """Print the warnings of a run, and what is guaranteed, in one line unless nothing is."""
     if quiet or STATUS.silent:
         return
     from echelon.experiments.studies.design import ways_out
@@ -185,8 +185,9 @@ def foretell(experiment: "Experiment", quiet: bool) -> None:
     stated = guarantee(*experiment)
     if not stated.claimed:
         print(f"echelon: {guarantee_text(stated)}", file=sys.stderr, flush=True)
-    elif sys.stderr.isatty():
-        print(f"echelon: {guarantee_lines(stated)[0]}", file=sys.stderr, flush=True)
+    elif stated.conditions or sys.stderr.isatty():
+        left = "".join(f", while {condition}" for condition in stated.conditions)
+        print(f"echelon: {guarantee_lines(stated)[0]}{left}", file=sys.stderr, flush=True)
     for change in ways_out(*experiment):
         print(f"  with {'':9}`--set {change}` there is a guarantee", file=sys.stderr, flush=True)
 

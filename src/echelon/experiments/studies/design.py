@@ -271,7 +271,7 @@ def _arguments(method: type[Method], spec: GainSpec | None, parts: Parts) -> dic
     return {**method.defaults, "domain": domain}
 
 
-# ---- the forecast of a run -----------------------------------------------------------------------
+# ---- what would give a run a guarantee -----------------------------------------------------------
 
 _SHARE = 0.9
 """Share of the longest stable step for the checked modes, since further modes lie between them."""

@@ -340,6 +340,7 @@ def _through(graph: Graph, event: Event, guarantee: Guarantee) -> JsonObject:
         verdict = GuaranteeVerdict.NONE
     return {
         "verdict": str(verdict),
+        "of": "all" if isinstance(event, Cut) else "others",
         "kind": str(guarantee.kind) if verdict is GuaranteeVerdict.GUARANTEED else None,
         "against": why,
         "conditions": list(guarantee.conditions) if not why else [],

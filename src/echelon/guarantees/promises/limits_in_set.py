@@ -78,7 +78,7 @@ def from_starts(line: Statement, starts: Statement) -> Statement:
     """Return the line on limits of a run from its starts: from outside the set one may act."""
     if line.verdict is not Verdict.HOLDS or not starts.fails:
         return line
-    text = "the starts are outside the set in which no limit acts"
+    text = "the starts are outside the certified set, where a limit may act"
     return _at_limits(text, starts.number, starts.number_text, starts.remedy, line.kind)
 
 

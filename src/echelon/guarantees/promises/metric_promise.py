@@ -222,12 +222,14 @@ class MetricPromise(Guarantee):
         """Return what is claimed near the trim, and what the region adds."""
         region, close = self.region, "starts close to the goals"
         premises = () if self.case.matched else ("the leader's input rests at its trim",)
+        if region is not None:
+            premises = ("time is continuous", *premises)
         if region is not None and self.certified is not None:
             return self._of_set(region, self.certified, premises)
         if region is not None:
             premises = (f"the leader stays in {self.domain}", *premises)
             return Claim(ClaimKind.CONVERGES, (close,), premises=premises)
-        if Hypothesis.LEADER not in self.hypotheses:
+        if Hypothesis.LEADER not in self.hypotheses or self.turns:
             premises = (f"the leader stays close to the trim{self.turns}", *premises)
         return Claim(ClaimKind.CONVERGES, (f"{close}; how close is not known",), premises=premises)
 
@@ -239,13 +241,20 @@ class MetricPromise(Guarantee):
             start = (f"any, for as long as all agents stay in {self.domain}",)
             notes = (f"no start is certified to stay: {certified.why}", certified.remedy)
             return Claim(what, start, premises=premises, notes=notes)
-        if certified.kind is not self.kind:
+        if certified.by_run:
             premises = ("the leader moves as in a run of its own", *premises)
         if math.isinf(certified.radius):
             return Claim(what, ("everywhere",), premises=premises)
         numbers = {"set_radius": Number(certified.radius, "", Rounding.DOWN)}
         start = f"sum_i delta_i'P delta_i <= {at_most(certified.radius)}^2"
         return Claim(what, (start,), premises=premises, numbers=numbers)
+
+    def _numbers(self, claim: Claim | None) -> dict[str, Number]:
+        numbers = super()._numbers(claim)
+        if not self.case.parts.world.ideal:
+            # The edge is one of current states and quick actuators.
+            numbers.pop("edge", None)
+        return numbers
 
     def why_covered(self) -> str:
         """Return why a run is covered that stayed in the domain."""

@@ -337,7 +337,7 @@ def guarantee_data(parts: Parts, settings: Settings) -> dict[str, Any]:
 
 
 def promises(parts: Parts, settings: Sequence[Settings], brief: bool = False) -> Promises:
-    """Yield what `promise` returns, or raises, under settings that differ in the seed alone.
+    """Yield what `guarantee` returns, or raises, under settings that differ in the seed alone.
 
     What no seed changes is computed once; `brief` leaves out what takes long.
     """

@@ -281,12 +281,14 @@ class CertifiedSet(NamedTuple):
     Attributes:
         radius: 0 where the set is empty, infinite where the domain bounds nothing.
         kind: of the argument; samples where the leader's excursion is read off a run of its own.
+        by_run: whether it is.
     """
 
     radius: float
     kind: Kind
     why: str
     remedy: str = ""
+    by_run: bool = False
 
     def as_mapping(self) -> dict[str, object]:
         """Return it ready for JSON, where an infinite radius is None."""
@@ -319,7 +321,7 @@ def certified_set(
     if paths is None:
         text = "the leader alone diverges"
         return CertifiedSet(0.0, kind, text, "give `leader.gain` another method")
-    return _less(parts, region, Kind.SAMPLES, excursion(parts, paths))
+    return _less(parts, region, Kind.SAMPLES, excursion(parts, paths))._replace(by_run=True)
 
 
 def _less(parts: Parts, region: RegionCertificate, kind: Kind, away: Array) -> CertifiedSet:

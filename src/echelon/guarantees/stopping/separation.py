@@ -72,7 +72,7 @@ class Separation(NamedTuple):
         why = "offsets change" if changing else "agents hold each other back"
         notes = (
             f"ellipsoids of {radii} m about the agents never overlap",
-            f"inputs are held for {at_least(self.step)} s, which `safety.margin` allows for",
+            f"inputs are held for {at_least(self.step)} s, which `safety.margin` has to allow for",
             f"convergence is not guaranteed while {why}",
         )
         numbers = {"kept_distance": Number(self.safety.distance, "m", Rounding.DOWN)}

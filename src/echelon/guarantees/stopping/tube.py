@@ -262,7 +262,7 @@ def _left(roots: Array, starts: Array, times: Array) -> Array:
 
 _PROOF, _UP = Kind.PROOF, Rounding.UP
 
-_ANY = ("any graph in which the leader reaches every agent", "this graph")
+_ANY = "any graph in which the leader reaches every agent"
 
 
 class Tube(NamedTuple):
@@ -278,7 +278,7 @@ class Tube(NamedTuple):
             it is not known, or was left out.
         borders: what is claimed of each border, and of what it was computed; ready for JSON.
         motor_load: None where motors have no limits, may not suffice, or were left out.
-        graphs: which graphs are meant, and this one, in words.
+        graphs: which graphs are meant, in words.
         offsets: how they change with time, and bounds of that; None of constant ones.
         kind: of the argument: the chains' responses and the path are enclosed in rationals; what
             somebody's class states of its flat coordinates or its motors was seen at samples.
@@ -292,7 +292,7 @@ class Tube(NamedTuple):
     who: tuple[str, ...]
     borders: tuple[dict[str, object], ...]
     motor_load: MotorLoad | None
-    graphs: tuple[str, str] = _ANY
+    graphs: str = _ANY
     network: LateMessages | None = None
     kind: Kind = _PROOF
     offsets: JsonObject | None = None
@@ -305,10 +305,10 @@ class Tube(NamedTuple):
     def claim(self) -> Claim:
         """Return what is claimed."""
         motors, network = self.motor_load, self.network
-        premises = ("the model is exact", *self._received())
+        premises = ("the model is exact", "time is continuous", *self._received())
         if self.offsets is not None:
             # Held inputs leave a rest where offsets go on changing.
-            premises += ("inputs follow offsets that change in continuous time",)
+            premises += ("inputs follow the offsets exactly",)
         numbers = {} if self.arrival is None else {"within_1_cm": Number(self.arrival, "s", _UP)}
         notes = ()
         if network is not None:
@@ -317,7 +317,7 @@ class Tube(NamedTuple):
         if motors is not None:
             numbers |= motors.numbers()
             notes += motors.notes()
-        graphs = ("any number of agents", self.graphs[0])
+        graphs = ("any number of agents", self.graphs)
         return Claim(ClaimKind.CONVERGES, self.who, graphs, premises, numbers, notes)
 
     def _received(self) -> tuple[str, ...]:
@@ -414,18 +414,17 @@ def _by(kind: Kind, model: ControlAffine, line: Statement) -> Statement:
     return dataclasses.replace(line, kind=kind, text=text)
 
 
-def _graphs(run: StoppingRun) -> tuple[str, str]:
+def _graphs(run: StoppingRun) -> str:
     schedule, law = run.parts.graph.schedule, run.law
     if law.feedforward is Feedforward.PARENT:
         # The speeds of the links add up in the tube.
-        text = f"any tree in which none is more than {amount(run.links, 'link')} from a leader"
-        return text, "this one"
+        return f"any tree in which none is more than {amount(run.links, 'link')} from a leader"
     if schedule is None:
         return _ANY
     every = "eventually" if schedule.period is None else "in every period"
     along = "along neighbours nearer to it " if law.leaderward else ""
     text = "any switching graphs over which the leader reaches every agent "
-    return f"{text}{along}{every}", "these"
+    return f"{text}{along}{every}"
 
 
 def _nothing(text: str, remedy: str, *before: Statement) -> tuple[None, list[Statement]]:

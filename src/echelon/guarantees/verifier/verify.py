@@ -12,6 +12,7 @@ import numpy as np
 
 from echelon.agents.models.model import ControlAffine
 from echelon.core.digits import about
+from echelon.core.errors import GainError
 from echelon.core.types import JsonObject, PathLike
 from echelon.guarantees.verifier import algebra
 from echelon.guarantees.verifier.agent_claims import MODEL as MODEL
@@ -62,6 +63,8 @@ def verify(path: PathLike, model: ControlAffine | None = None) -> Verification:
         GainError: the file is neither, or a part is missing or unknown.
     """
     document = read_json(path)
+    if "promise" in document and STATED not in document:
+        raise GainError(f"`{path}` was written by an earlier version of echelon; make it again.")
     if states_gain(document):
         saved = read(document, path)
         note = f" The gain guarantees no decay: the slowest mode is {about(saved.abscissa)} 1/s."

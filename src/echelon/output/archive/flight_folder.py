@@ -20,8 +20,7 @@ from echelon.core.files import write_atomic
 from echelon.core.numerics import precision
 from echelon.core.trace import shared_traces
 from echelon.core.types import Array, JsonObject
-from echelon.core.words import MessageContent
-from echelon.guarantees.promises.promise import guarantee_data
+from echelon.core.words import MessageContent, Verdict
 from echelon.laws.law import Speaks, Travels
 from echelon.output.archive.folder import write_errors
 from echelon.simulation.engine.agent import Agent, OwnLaw
@@ -48,7 +47,8 @@ _EXCLUDES = (
     "supervisor that stops it",
     "other steps than `dt`",
 )
-_STATED = ("verdict", "claim", "theorem", "kind", "start", "premises", "numbers", "ignores")
+_STATED = ("verdict", "claim", "theorem", "kind", "start", "graphs", "premises", "numbers")
+_STATED += ("ignores", "covers_start", "until")
 """What law.json repeats of the guarantee of the formation."""
 _CURRENT = "late or lost messages: the guarantee assumes that `z` is of the current step"
 _LATE = "other networks than `network`"
@@ -116,12 +116,19 @@ def _facts(
         **_description(own, functions),
         "dt": dt,
         "network": network_facts(own, dt, functions),
-        "guarantee": {key: stated[key] for key in _STATED},
+        "guarantee": {key: stated[key] for key in _STATED} | _failed(stated),
         "excluded": [*_EXCLUDES, _LATE if isinstance(own.loop.network, LateNetwork) else _CURRENT],
         "echelon": __version__,
         "sha256": {name: hashlib.sha256(text.encode()).hexdigest() for name, text in files.items()},
     }
     return json.dumps(described, indent=2) + "\n"
+
+
+def _failed(stated: JsonObject) -> JsonObject:
+    """Return what a claim is left conditional on, and what stands against any."""
+    lines = [line for line in stated["conditions"] if line["verdict"] == str(Verdict.FAILS)]
+    names = {"while": "while", "against": "reason"}
+    return {name: [x[key] for x in lines if x[key]] for name, key in names.items()}
 
 
 def _sizes(functions: Mapping[str, LawFunction]) -> dict[str, int]:

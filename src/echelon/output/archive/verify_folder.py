@@ -234,7 +234,8 @@ def _compare(
         stored, value = read_json(files.claims), json.loads(json.dumps(summary(result)))
         theirs, ours = [{k: x[k] for k in names if k in x} for x in (stored, value)]
         yield from compare_values("", theirs, ours, digits)
-        covered = [{COVERED: x[STATED].get(COVERED)} for x in (stored, value)]
+        guarantees = [x[STATED] if isinstance(x.get(STATED), dict) else {} for x in (stored, value)]
+        covered = [{COVERED: x.get(COVERED)} for x in guarantees]
         yield from compare_values(STATED, covered[0], covered[1])
         # What both files say of the program: nothing else says it.
         versions = {k[8:]: x for k, x in data.attributes.items() if k.startswith("version_")}

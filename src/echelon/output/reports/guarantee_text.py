@@ -21,11 +21,11 @@ _KINDS = {
 }
 _LABELS = {
     ClaimKind.CONVERGES: "converges",
-    ClaimKind.BOUNDED: "V stays",
+    ClaimKind.BOUNDED: "V never rises",
     ClaimKind.APART: "never touch",
 }
 _NOTED = (Hypothesis.CLAIMS, Hypothesis.MESSAGES, Hypothesis.OWN_STATE)
-"""Conditions that stand as a note where they fail and leave a guarantee."""
+"""Conditions that are told where they fail and leave a guarantee."""
 Row = tuple[str, str]
 """A label, empty where it is that of the row above, and a phrase."""
 
@@ -63,7 +63,7 @@ def _data(stated: "Guarantee | Mapping[str, object]") -> JsonObject:
 
 _BRIEF = (
     *("while", "since", "would help", "until", *_LABELS.values()),
-    *("rate", "within 1 cm", "distance", "if", "ignores"),
+    *("rate", "within 1 cm", "distance", "if", "ignores", "but"),
 )
 """Labels that a screen has."""
 
@@ -94,7 +94,8 @@ def guarantee_rows(data: JsonObject) -> Iterator[Row]:
         yield from _against(data)
     else:
         yield from _claimed(data)
-    yield from _labelled("note", _notes(data))
+    yield from _labelled("but", _failing(data))
+    yield from _labelled("note", data["notes"])
     until = data.get("until")
     if until is not None:
         head = heading(until["guarantee"])
@@ -155,15 +156,16 @@ def shown(data: JsonObject, name: str, digits: int = 3) -> str:
 def _numbers(data: JsonObject) -> Iterator[Row]:
     numbers = data["numbers"]
     yield from _rates(data)
+    lost = int(number_in(data, "lost_in_a_row") or 0)
+    seldom = ", in all but one run in a million" if lost else ""
     if "within_1_cm" in numbers:
-        yield "within 1 cm", f"after {shown(data, 'within_1_cm')} from these starts"
+        yield "within 1 cm", f"after {shown(data, 'within_1_cm')} from these starts{seldom}"
     if "kept_distance" in numbers:
         yield "distance", f"{shown(data, 'kept_distance')} are kept between centres, scaled"
     if "first_packet" in numbers:
-        yield "messages", f"everybody has a packet after {shown(data, 'first_packet')}"
-        lost = int(number_in(data, "lost_in_a_row") or 0)
+        yield "messages", f"everybody has a packet after {shown(data, 'first_packet')}{seldom}"
         if lost:
-            yield "", f"in all but one run in a million no link loses more than {lost} in a row"
+            yield "", f"no link loses more than {lost} in a row{seldom}"
         if "delay" in numbers:
             yield "", f"late ones cost a delay of {shown(data, 'delay')} at most"
     if "motor_least" in numbers:
@@ -176,8 +178,8 @@ def _rates(data: JsonObject) -> Iterator[Row]:
     numbers, rate, slow = data["numbers"], number_in(data, "rate"), number_in(data, "slowest_mode")
     everywhere = data["theorem"] in (str(Theorem.T5), str(Theorem.T9))
     if rate:
-        text = f"{shown(data, 'rate')} or faster"
-        yield "rate", f"{shown(data, 'rate')} eventually" if everywhere else text
+        how = "eventually" if not data["theorem"] else "or faster"
+        yield "rate", f"{shown(data, 'rate')} {'eventually, on this graph' if everywhere else how}"
         if "message_age" in numbers:
             age = f"no message in use is older than {shown(data, 'message_age')}"
             quick = "quick_rate" in numbers
@@ -185,7 +187,8 @@ def _rates(data: JsonObject) -> Iterator[Row]:
     if "rate_alone" in numbers:
         yield "rate", f"{shown(data, 'rate_alone')} eventually, where nobody is held back"
     if number_in(data, "coupling") is not None and not data["theorem"] and slow is not None:
-        above = f"; any above {shown(data, 'edge', 4)} suffices" if "edge" in numbers else ""
+        above = f"any above {shown(data, 'edge', 4)} suffices in continuous time"
+        above = f"; {above}" if "edge" in numbers else ""
         mode = "" if rate and abs(rate + slow) <= 1e-6 * rate else _mode(slow)
         yield "coupling", f"{shown(data, 'coupling', 4)}{above}{mode}"
 
@@ -194,8 +197,7 @@ def _mode(slow: float) -> str:
     return f"; the slowest mode alone decays at {at_most(-slow)} 1/s" if slow < 0.0 else ""
 
 
-def _notes(data: JsonObject) -> Iterator[str]:
-    yield from data["notes"]
+def _failing(data: JsonObject) -> Iterator[str]:
     names = {name.value for name in _NOTED}
     for line in data["conditions"]:
         if line["name"] in names and _fails(line) and not line["reason"] and not line["while"]:
@@ -216,7 +218,8 @@ def short_form(data: JsonObject) -> str:
         return f"no guarantee: {data['theorem'] or data['kind']} holds while {left[0]}"
     if data["claim"] == str(ClaimKind.APART):
         return f"guaranteed: agents stay apart, {data['theorem']}"
-    rate = f"{shown(data, 'rate')}" if number_in(data, "rate") else "V does not rise"
+    bounded = data["claim"] == str(ClaimKind.BOUNDED)
+    rate = "V does not rise" if bounded else shown(data, "rate")
     return f"guaranteed: {rate}, {data['theorem'] or data['kind']}"
 
 
@@ -225,10 +228,13 @@ def through_event(data: JsonObject) -> str:
     if data["against"]:
         return f"Nothing is guaranteed through it: {data['against']}."
     verdict = GuaranteeVerdict.named(data["verdict"])
+    whom = "it" if data["of"] == "all" else "all others through it"
+    ignored = f"ignores that {' and '.join(data['ignores'])}"
     if verdict is GuaranteeVerdict.GUARANTEED:
-        return "The guarantee covers it."
+        return f"The guarantee covers {whom}."
     if data["conditions"]:
-        return f"Not guaranteed: the claim covers it while {' and '.join(data['conditions'])}."
+        text = f"Not guaranteed: the claim covers {whom} while {' and '.join(data['conditions'])}"
+        return f"{text}. It {ignored}." if data["ignores"] else f"{text}."
     if data["ignores"]:
-        return f"The guarantee covers it, but ignores that {' and '.join(data['ignores'])}."
+        return f"The guarantee would cover {whom}, but {ignored}."
     return "Nothing is guaranteed."

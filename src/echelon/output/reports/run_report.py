@@ -140,7 +140,7 @@ def _width(console: "Console") -> int:
     return WIDTH if console.is_terminal else UNWRAPPED
 
 
-OBSERVED = 3
+_FEW = 3
 """Sentences on what was observed that fit on a screen."""
 
 
@@ -165,8 +165,8 @@ def print_screen(console: "Console", result: Result, numbers: Metrics) -> None:
 def _told(result: Result, numbers: Metrics, stated: Guarantee) -> Iterator[str]:
     """Yield a few sentences on what was observed, and all warnings."""
     seen = (
-        *observations(result, numbers, stated),
         *coverage(result, stated),
+        *observations(result, numbers, stated),
         *(f"{x.sentence()} {through_event(x.guarantee)}" for x in event_outcomes(result)),
         *_closest(result, numbers),
         *_lag(result),
@@ -174,7 +174,7 @@ def _told(result: Result, numbers: Metrics, stated: Guarantee) -> Iterator[str]:
     )
     warnings = [text for text in seen if text.startswith(_WARNING)]
     others = [text for text in seen if not text.startswith(_WARNING)]
-    yield from (*others[:OBSERVED], *warnings)
+    yield from (*others[:_FEW], *warnings)
     yield from (f"{_WARNING}{text}" for text in result.warnings)
 
 
@@ -243,7 +243,7 @@ def _cell(agent: LeaderMetrics | FollowerMetrics, name: str) -> str:
 
 
 def explain(result: Result, numbers: Metrics) -> tuple[str, ...]:
-    """Return the sentences of a report: outcome, what was observed, world, guarantee, V."""
+    """Return the sentences of a report: outcome, what was observed, world, coverage, V."""
     stated = guarantee(result.parts, result.settings)
     return (
         *_outcome(result, numbers, stated),
