@@ -119,7 +119,7 @@ def design(
         designs.append(_design(cls, _arguments(cls, spec, built.parts), built))
     designs = tuple(designs)
     best, dt = recommended(designs, built.settings.dt), built.settings.dt
-    reason = "No method gives a stable loop here." if best is None else because(best, designs, dt)
+    reason = _why_none(designs) if best is None else because(best, designs, dt)
     return Designs(designs, best, reason, built.settings)
 
 
@@ -160,6 +160,14 @@ def _is_domain(model: ControlAffine, bounds: Mapping[str, Any]) -> bool:
 def recommended(designs: tuple[Design, ...], dt: float) -> Design | None:
     """Return the best of the stable designs; None without any."""
     return max((d for d in designs if d.stable), key=lambda d: d.merit(dt), default=None)
+
+
+def _why_none(designs: tuple[Design, ...]) -> str:
+    """Return that no design is recommended, and what stands against a guarantee of all of them."""
+    each = [set(d.promise.reasons) for d in designs if d.promise is not None]
+    common = sorted(set.intersection(*each)) if each else []
+    text = "No method gives a stable loop here"
+    return f"{text}: {'; '.join(common)}." if common else f"{text}."
 
 
 def because(best: Design, designs: tuple[Design, ...], dt: float) -> str:
