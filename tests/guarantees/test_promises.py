@@ -175,7 +175,7 @@ def test_a_gain_of_another_graph_or_coupling_is_promised_what_it_does():
     report = " ".join(ech.report(ech.simulate(parts, settings(horizon=0.02))).split())
     assert in_words(found) in report
     assert found.slowest == pytest.approx(slowest, rel=0.01)
-    assert f"rate {at_most(-found.slowest)} 1/s or faster" in report
+    assert f"rate {at_most(-found.slowest)} 1/s eventually" in report
     # An edited coupling, too weak for a model that grows.
     model = ech.models.Linear(A=[[0.0, 1.0], [1.0, 0.0]], B=[[0.0], [1.0]])
     gain = ech.synthesize(model, PATH, ech.gains.Riccati())
@@ -659,7 +659,7 @@ def test_a_law_names_what_proves_its_guarantee():
     assert found.as_mapping()["claim"] == "bounded"
     assert ech.check(parts, settings()).promise is found
     report = ech.report(ech.simulate(parts, settings(horizon=0.1)))
-    assert "V stays from where they start" in " ".join(report.split())
+    assert "V never rises from where they start" in " ".join(report.split())
     seeds = [settings()._replace(seed=k) for k in range(2)]
     assert [type(each) for each in promises(parts, seeds)] == [RestPromise, RestPromise]
     other = parts.replace(drive=ech.Laws(TrimInput(), TrimInput()))

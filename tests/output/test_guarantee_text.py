@@ -72,11 +72,15 @@ def test_each_entry_has_its_row(changes, said):
     [
         ({"against": "agent 0 leads"}, "Nothing is guaranteed through it: agent 0 leads."),
         ({"verdict": "guaranteed"}, "The guarantee covers it."),
+        (
+            {"verdict": "guaranteed", "of": "others"},
+            "The guarantee covers all others through it.",
+        ),
         ({"conditions": ["a", "b"]}, "Not guaranteed: the claim covers it while a and b."),
-        ({"ignores": ["a"]}, "The guarantee covers it, but ignores that a."),
+        ({"ignores": ["a"]}, "The guarantee would cover it, but ignores that a."),
         ({}, "Nothing is guaranteed."),
     ],
 )
 def test_an_event_has_one_sentence_on_its_guarantee(changes, said):
-    nothing = {"verdict": "none", "against": "", "conditions": [], "ignores": []}
+    nothing = {"verdict": "none", "of": "all", "against": "", "conditions": [], "ignores": []}
     assert through_event(nothing | changes) == said

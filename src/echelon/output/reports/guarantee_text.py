@@ -187,8 +187,9 @@ def _rates(data: JsonObject) -> Iterator[Row]:
     if "rate_alone" in numbers:
         yield "rate", f"{shown(data, 'rate_alone')} eventually, where nobody is held back"
     if number_in(data, "coupling") is not None and not data["theorem"] and slow is not None:
-        above = f"any above {shown(data, 'edge', 4)} suffices in continuous time"
-        above = f"; {above}" if "edge" in numbers else ""
+        above = ""
+        if "edge" in numbers:
+            above = f"; any above {shown(data, 'edge', 4)} suffices in continuous time"
         mode = "" if rate and abs(rate + slow) <= 1e-6 * rate else _mode(slow)
         yield "coupling", f"{shown(data, 'coupling', 4)}{above}{mode}"
 
