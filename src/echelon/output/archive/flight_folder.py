@@ -21,6 +21,7 @@ from echelon.core.numerics import precision
 from echelon.core.trace import shared_traces
 from echelon.core.types import Array, JsonObject
 from echelon.core.words import MessageContent, Verdict
+from echelon.guarantees.promises.promise import guarantee_data
 from echelon.laws.law import Speaks, Travels
 from echelon.output.archive.folder import write_errors
 from echelon.simulation.engine.agent import Agent, OwnLaw
