@@ -162,5 +162,6 @@ def test_check_run_sweep_verify_and_json_agree(echelon, tmp_path):
     over = ("--over", "model.parameters.most=0.05,1000")
     _, out, _ = echelon("sweep", "carts.yaml", *over, "--out", "s")
     said = " ".join(out.split())
-    assert "With a guarantee: 0 of 2." in said
-    assert "while no input is at a limit: 2; covered in every step: 1." in said
+    # A limit of 1000 is shown to suffice, and one of 0.05 is not.
+    assert "With a guarantee: 1 of 2." in said
+    assert "while no input is at a limit: 1; covered in every step: 0." in said

@@ -302,7 +302,7 @@ def test_only_a_law_that_keeps_the_theorem_is_promised_it():
     parts = parts_of(model, PATH, gain, "none", circle)
     errors = ech.simulate(parts, settings(horizon=10.0)).errors
     assert np.abs(errors[0]).max() == 0.0 and np.abs(errors[-1]).max() > 0.1
-    rests = "once the leader's input rests at its trim"
+    rests = "the leader's input rests at its trim"
     assert rests in in_words(ech.guarantee(parts, settings()))
 
 

@@ -307,7 +307,7 @@ def test_a_broken_offset_and_a_missing_relay_are_named():
     assert line.text.startswith("the offset of agent 1: it changes the drift")
     lines, found = verdicts("paper", "follower.feedforward=none")
     assert lines["leader's motion is matched"].verdict is Verdict.FAILS
-    assert "once the leader's input rests" in in_words(found.promise)
+    assert "the leader's input rests" in in_words(found.promise)
 
 
 def test_a_weak_input_weakens_the_trim_thrust_too():

@@ -300,11 +300,10 @@ def ways_out(parts: Parts, settings: Settings) -> tuple[str, ...]:
 
 def _changes(parts: Parts, settings: Settings) -> Iterator[str]:
     """Yield the changes of a scenario, quickly computed, under which something is guaranteed."""
-    step = guarantee(parts, settings).hypotheses[Hypothesis.SAMPLING]
-    if step.fails:
-        longest = _SHARE * guarantee(parts, settings).longest_step(settings)
+    longest = _SHARE * guarantee(parts, settings).longest_step(settings)
+    if 0.0 < longest < settings.dt:
         # With an integer fraction of the step, the horizon remains a whole number of steps.
-        shorter = settings.dt / math.ceil(settings.dt / longest) if longest > 0.0 else settings.dt
+        shorter = settings.dt / math.ceil(settings.dt / longest)
         if guarantee(parts, settings._replace(dt=shorter)).promised:
             yield f"simulation.dt={at_most(shorter, 6)}"
     law = parts.drive.follower if isinstance(parts.drive, Laws) else None
