@@ -9,6 +9,8 @@ from recordings import GUARANTEE
 from rich.console import Console
 
 import echelon as ech
+from echelon.core.statement import Hypothesis, holds
+from echelon.core.words import Kind
 from echelon.experiments.results.metrics import metrics
 from echelon.experiments.scenario.scenario import bundled_scenarios
 from echelon.output.reports.guarantee_text import (
@@ -84,3 +86,20 @@ def test_each_entry_has_its_row(changes, said):
 def test_an_event_has_one_sentence_on_its_guarantee(changes, said):
     nothing = {"verdict": "none", "of": "all", "against": "", "conditions": [], "ignores": []}
     assert through_event(nothing | changes) == said
+
+
+@pytest.mark.parametrize(
+    ("number", "shown", "unit"),
+    [
+        (0.0086433, "8.64 ms", "s"),
+        (-26.09, "-26.1 .. 26.28 N, 78.1 deg", "N"),
+        (-1.269, "-1.26 1/s at 1 rad/s", "1/s"),
+        # The number is another than the first one of the table.
+        (0.0424, "2.29 m/s, 3.22 m/s^2, 4.25 % of the input range", ""),
+        (0.994, "dt 0.005 s", ""),
+        (12, "rank 12 of 12", ""),
+    ],
+)
+def test_a_condition_has_the_unit_of_its_own_number(number, shown, unit):
+    line = holds(Hypothesis.LIMITS, Kind.PROOF, "", number, shown)
+    assert line.as_mapping()["unit"] == unit

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
-from echelon.core.digits import about, at_least, at_most
+from echelon.core.digits import about, at_least, at_most, finite_or_none
 from echelon.core.types import JsonObject
 from echelon.core.words import Word
 
@@ -41,8 +41,7 @@ class Number(NamedTuple):
 
     def as_mapping(self) -> JsonObject:
         """Return it ready for JSON, where a number that is not finite is None."""
-        finite = abs(self.value) < float("inf")
-        value = self.value if finite else None
+        value = finite_or_none(self.value)
         return {"value": value, "unit": self.unit, "rounding": str(self.rounding)}
 
 

@@ -7,7 +7,8 @@ A slowest mode is the negative of a rate, and is written with `at_least`. `about
 """
 
 import decimal
-from typing import Final
+import math
+from typing import Final, SupportsFloat
 
 _KNOWN: Final = 12
 """Digits of a number that are read: what is behind them is rounding of its computation."""
@@ -26,6 +27,11 @@ def at_least(x: float, digits: int = 3) -> str:
 def about(x: complex, digits: int = 3) -> str:
     """Return a number with so many digits, to the nearest: what was set, seen or found false."""
     return f"{x:.{digits}g}"
+
+
+def finite_or_none(value: SupportsFloat | None) -> float | None:
+    """Return a number as a float, or None where it does not exist or is not finite."""
+    return float(value) if value is not None and math.isfinite(value) else None
 
 
 def _towards(x: float, digits: int, rounding: str) -> str:

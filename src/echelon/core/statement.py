@@ -4,6 +4,7 @@ import dataclasses
 import re
 from typing import NamedTuple, TypeAlias, final
 
+from echelon.core.digits import finite_or_none
 from echelon.core.words import Kind, Verdict, Word
 
 
@@ -77,11 +78,9 @@ class Cause(NamedTuple):
     remedy: str
 
 
-_UNITS = {"1/s": "1/s", "ms": "s", "s": "s", "m": "m", "N": "N", "Hz": "Hz", "m/s": "m/s"}
-"""How a table writes a number's unit, and the unit of the number itself."""
-_UNIT = re.compile(
-    rf"\d (?P<unit>{'|'.join(sorted(map(re.escape, _UNITS), key=len)[::-1])})(?![\w/^])"
-)
+_UNITS = {"1/s": ("1/s", 1.0), "ms": ("s", 1e-3), "s": ("s", 1.0), "m": ("m", 1.0), "N": ("N", 1.0)}
+"""How a table writes a number's unit, the unit of the number itself, and the factor between."""
+_UNIT = re.compile(r"^(?P<number>[-+.\de]+)(?: \.\. [-+.\de]+)? (?P<unit>1/s|ms|s|m|N)(?![\w/^])")
 
 
 @final
@@ -134,11 +133,13 @@ class Statement:
 
     @property
     def unit(self) -> str:
-        """The unit of the number: that of the text in which a table has it."""
-        named = _UNIT.search(self.number_text)
-        # Its number is a spectral radius, and a table shows the step.
-        named = None if self.statement is Hypothesis.SAMPLING else named
-        return "" if named is None else _UNITS[named["unit"]]
+        """The unit of the number, where a table begins with this number and a unit."""
+        named = _UNIT.match(self.number_text)
+        if named is None or self.number is None:
+            return ""
+        unit, factor = _UNITS[named["unit"]]
+        shown = factor * float(named["number"])
+        return unit if abs(shown - self.number) <= 0.02 * abs(self.number) else ""
 
     @property
     def shown_verdict(self) -> str:
@@ -153,13 +154,12 @@ class Statement:
 
     def as_mapping(self) -> dict[str, str | float | None]:
         """Return it ready for JSON, where a number that is not finite is None."""
-        value, limit = map(_finite, (self.number, self.limit))
         return {
             "name": self.name,
             "verdict": str(self.verdict),
             "kind": str(self.kind),
-            "value": value,
-            "limit": limit,
+            "value": finite_or_none(self.number),
+            "limit": finite_or_none(self.limit),
             "unit": self.unit,
             "shown": self.number_text,
             "text": self.text,
@@ -167,10 +167,6 @@ class Statement:
             "reason": self.reason,
             "while": self.condition,
         }
-
-
-def _finite(number: float | None) -> float | None:
-    return number if number is not None and abs(number) < float("inf") else None
 
 
 def holds(
@@ -197,8 +193,8 @@ def fails(
     reason: str = "",
 ) -> Statement:
     """Return the line of what was found false; with a `reason` it rules out any guarantee."""
-    found = Statement(statement, Verdict.FAILS, kind, number, number_text, text, remedy, reason)
-    return dataclasses.replace(found, limit=limit)
+    numbers = number, number_text, text, remedy, reason
+    return Statement(statement, Verdict.FAILS, kind, *numbers, limit=limit)
 
 
 def unneeded(

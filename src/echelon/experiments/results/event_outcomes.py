@@ -5,10 +5,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int
 
+from echelon.core.digits import finite_or_none
 from echelon.core.types import JsonObject
 from echelon.guarantees.promises.hypotheses import events_in_words
 from echelon.guarantees.promises.promise import guarantee
-from echelon.simulation.engine.result import Result, finite_or_none
+from echelon.simulation.engine.result import Result
 from echelon.simulation.step.meter import SETTLED, event_steps
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from echelon.agents.models.model import ControlAffine
 from echelon.core.compiled import cached_jit
-from echelon.core.digits import about, at_most
+from echelon.core.digits import about, at_most, finite_or_none
 from echelon.core.errors import Outcome, check_kind
 from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis
@@ -31,7 +31,7 @@ from echelon.experiments.results.run_numbers import (
 )
 from echelon.guarantees.promises.coverage import covered
 from echelon.guarantees.promises.promise import Guarantee
-from echelon.simulation.engine.result import Result, finite_or_none
+from echelon.simulation.engine.result import Result
 from echelon.simulation.step.meter import SETTLED, output_error, steps_per_slice
 
 ROUNDING = 1e-4

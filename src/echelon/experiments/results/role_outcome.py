@@ -8,11 +8,12 @@ from typing import NamedTuple, final
 import jax.numpy as jnp
 import numpy as np
 
+from echelon.core.digits import finite_or_none
 from echelon.core.errors import Outcome
 from echelon.core.numerics import precision
 from echelon.core.types import JsonObject
 from echelon.experiments.results.metrics import metrics
-from echelon.simulation.engine.result import Result, finite_or_none
+from echelon.simulation.engine.result import Result
 from echelon.simulation.step.meter import SETTLED
 
 

@@ -86,7 +86,8 @@ def _guarantee_findings(stated: object) -> Iterator[ClaimCheck]:
     if tube is not None:
         yield from tube_findings(tube)
     for key in stated:
-        yield unchecked(f"{CLAIMED}{key}", "", "it follows from the run's scenario alone")
+        from_ = "run itself" if key == "covered" else "run's scenario alone"
+        yield unchecked(f"{CLAIMED}{key}", "", f"it follows from the {from_}")
 
 
 def _collect(checks: Iterator[ClaimCheck]) -> tuple[ClaimCheck, ...]:

@@ -252,7 +252,7 @@ def explain(result: Result, numbers: Metrics) -> tuple[str, ...]:
         *_lag(result),
         *observations(result, numbers, stated),
         *_world(result),
-        *_guarantee(result, stated),
+        *_reach(result, stated),
         *_lyapunov_trend(result, stated),
     )
 
@@ -349,7 +349,7 @@ def _messages(result: Result) -> Iterator[str]:
     yield f"Messages: {traffic.sent} sent, {traffic.lost} lost{late}{ages}."
 
 
-def _guarantee(result: Result, guarantee: Guarantee) -> Iterator[str]:
+def _reach(result: Result, guarantee: Guarantee) -> Iterator[str]:
     yield from coverage(result, guarantee)
     if len(result.graph.leaders) > 1:
         yield f"Leaders: {who_hears_whom(result.graph)}; goals are relative to the nearest leader."

@@ -231,8 +231,3 @@ class Result(FrameNumbers):
             MissingExtraError: the page's three.js is not built.
         """
         return CellPage(notebook_page("replay", self), height)
-
-
-def finite_or_none(value: float | np.floating | None) -> float | None:
-    """Return a number as a float, or None where it does not exist or is not finite."""
-    return float(value) if value is not None and np.isfinite(value) else None
