@@ -165,3 +165,15 @@ def test_check_run_sweep_verify_and_json_agree(echelon, tmp_path):
     # A limit of 1000 is shown to suffice, and one of 0.05 is not.
     assert "With a guarantee: 1 of 2." in said
     assert "while no input is at a limit: 1; covered in every step: 0." in said
+
+
+def test_no_edge_of_the_coupling_is_told_where_messages_are_late():
+    gain = ech.synthesize(DOUBLE, GRAPH, ech.gains.Riccati())
+    laws = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain))
+    formation = ech.Formation.line(DOUBLE, GRAPH)
+    for network in (None, ech.Network(rate=20.0, delay=0.05, prediction="packet")):
+        parts = ech.Parts(DOUBLE, GRAPH, formation, laws, world=ech.World(network=network))
+        found = ech.guarantee(parts, SETTINGS)
+        told = f"{found.hypotheses[Hypothesis.COUPLING].explanation} {in_words(found)}"
+        assert ("edge" in found.as_mapping()["numbers"]) is (network is None)
+        assert ("every mode decays" in told or "suffices" in told) is (network is None)

@@ -249,12 +249,11 @@ class MetricPromise(Guarantee):
         start = f"sum_i delta_i'P delta_i <= {at_most(certified.radius)}^2"
         return Claim(what, (start,), premises=premises, numbers=numbers)
 
-    def _numbers(self, claim: Claim | None) -> dict[str, Number]:
-        numbers = super()._numbers(claim)
-        if not self.case.parts.world.ideal:
-            # The edge is one of current states and quick actuators.
-            numbers.pop("edge", None)
-        return numbers
+    @property
+    def edge(self) -> float | None:
+        """The coupling from which on every mode is proved to decay; None where none is known."""
+        # It is one of current states and quick actuators.
+        return super().edge if self.case.parts.world.ideal else None
 
     def why_covered(self) -> str:
         """Return why a run is covered that stayed in the domain."""

@@ -247,6 +247,9 @@ def _detectable(case: GuaranteeInputs) -> Statement:
 
 def _coupled(case: GuaranteeInputs) -> Statement:
     edge, c = case.loop.certificate.edge, case.loop.closed.coupling
+    if not case.parts.world.ideal:
+        text = "an edge is known of current states and quick actuators alone"
+        return unneeded(Hypothesis.COUPLING, _LINEAR, text, c, f"c {about(c, 4)}")
     if edge is None:
         return holds(Hypothesis.COUPLING, Kind.PROOF, "no edge is known", c, f"c {about(c, 4)}")
     number = c, f"c {about(c, 4)}, edge {at_least(edge, 4)}", edge
