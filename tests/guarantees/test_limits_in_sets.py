@@ -8,7 +8,8 @@ from in_words import in_words
 
 import echelon as ech
 from echelon.core.statement import NO_LIMIT, Hypothesis
-from echelon.core.words import GuaranteeVerdict
+from echelon.core.words import GuaranteeVerdict, Kind
+from echelon.guarantees.promises.coverage import covered
 from echelon.guarantees.promises.promise import promises
 
 SETTINGS, GRAPH = ech.Settings(horizon=4.0, dt=0.01), ech.Graph.path(3)
@@ -68,6 +69,49 @@ def test_no_input_passes_its_limit_from_the_border_of_the_set(directed):
     assert most <= 1.0 + 1e-9
     # On an undirected graph the border is where the first input reaches its limit.
     assert directed or most == pytest.approx(1.0, rel=1e-6)
+
+
+def by_hand(parts, gain, starts, dt, steps):
+    """States (steps + 1, N, 4) of clipped carts in the plane, each step in closed form."""
+    L = np.asarray(parts.graph.laplacian().toarray())
+    B = np.kron(np.array([[0.0], [1.0]]), np.eye(2))
+    K = gain.coupling * gain.R_inverse @ B.T @ gain.P
+    x, out = starts.copy(), [starts]
+    for _ in range(steps):
+        u = np.clip(-(L @ (x - parts.formation.offsets)) @ K.T, -1.0, 1.0)
+        u[0] = 0.0
+        x = np.hstack([x[:, :2] + dt * x[:, 2:] + 0.5 * dt**2 * u, x[:, 2:] + dt * u])
+        out.append(x)
+    return np.array(out)
+
+
+def test_starts_from_which_a_run_enters_the_set_are_covered_although_limits_act():
+    model, graph = Cart(dimension=2), ech.Graph.path(4)
+    parts, gain = parts_of(model, graph)
+    settings = ech.Settings(horizon=60.0, dt=0.05)
+    radius = ech.guarantee(parts, settings).certified.radius
+    starts = on_the_border(parts, gain, 40.0 * radius, seed=3)
+    parts = parts.replace(initial=starts)
+    found, result = ech.guarantee(parts, settings), ech.simulate(parts, settings)
+    assert result.saturated.max() > 0.0
+    states = by_hand(parts, gain, starts, 0.05, settings.steps)
+    y = states - parts.formation.offsets
+    delta = y - y[:, :1]
+    sizes = np.sqrt(np.einsum("tia,ab,tib->t", delta, gain.P, delta))
+    first = int(np.flatnonzero(sizes <= 0.99 * radius)[0])
+    assert first > 0 and (sizes[first:] <= radius).all()
+    assert found.enters == pytest.approx(0.05 * first)
+    assert found.verdict is GuaranteeVerdict.GUARANTEED and found.covers_start
+    assert found.hypotheses[Hypothesis.STARTS].kind is Kind.SAMPLES
+    assert covered(result, found)
+    assert any("run from these starts" in each for each in found.claim().premises)
+    # Of a run that ends before, nothing is known.
+    short = settings._replace(horizon=0.5 * found.enters)
+    soon = ech.guarantee(parts, short)
+    assert soon.verdict is GuaranteeVerdict.CONDITIONAL and soon.covers_start is False
+    assert not covered(ech.simulate(parts, short), soon)
+    [told] = promises(parts, [settings], brief=True)
+    assert told.verdict is GuaranteeVerdict.CONDITIONAL and covered(result, told)
 
 
 class Clipped(ech.models.DoubleIntegrator):

@@ -10,6 +10,7 @@ from echelon.core.digits import about
 from echelon.core.types import Array
 from echelon.core.words import Kind, Theorem
 from echelon.guarantees.promises.promise import Guarantee
+from echelon.guarantees.promises.region import entered
 from echelon.simulation.engine.result import Result
 
 _EDGE = 1e-9  # relative; a state that rests on a bound has not left it
@@ -32,9 +33,11 @@ def coverage(result: Result, promise: Guarantee) -> Iterator[str]:
         return
     what = "proof" if promise.kind is Kind.PROOF else "guarantee on the domain"
     what = "conditional claim" if promise.conditions else what
-    against = _against(result, promise)
+    against, inside = _against(result, promise), _inside_from(result, promise)
     if against:
         yield f"The {what} does not cover this run: {against}."
+    elif inside:
+        yield f"The {what} covers this run: all agents were in the certified set at {inside:.4g} s."
     else:
         yield f"The {what} covers this run: {promise.why_covered()}."
 
@@ -53,12 +56,23 @@ def _against(result: Result, promise: Guarantee) -> str:
     """Return why a claim does not cover a run; empty where it does."""
     left = None if promise.region is None else first_exit(result, promise)
     limited = float(result.saturated.max())
+    if _inside_from(result, promise) is not None:
+        # What happened before is what the run did; from here on nothing leaves, and no limit acts.
+        return " and ".join(promise.ignores)
     if left is not None:
         when = f"at {about(left.time, 4)} s" if np.isfinite(left.time) else "in some step"
         return f"agent {left.agent} left the domain {when} (`{left.name}`)"
     if limited:
         return f"a limit acted on an agent in {about(100.0 * limited)} % of the steps"
     return " and ".join(promise.ignores)
+
+
+def _inside_from(result: Result, promise: Guarantee) -> float | None:
+    """Return from when (s) a run was in the certified set by its stored frames; None for never."""
+    certified = promise.certified
+    if certified is None or not 0.0 < certified.radius < np.inf or result.presence is not None:
+        return None
+    return entered(result, certified.radius)
 
 
 def first_exit(result: Result, promise: Guarantee) -> Exit | None:

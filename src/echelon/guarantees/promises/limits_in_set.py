@@ -4,6 +4,7 @@ In {sum_i w_i delta_i'P delta_i <= r^2} the input of follower j is u_0 + S (K de
 z_j), z_j = sum_i L_ji delta_i: a row h of its limits moves by at most r |a| in the set's norm.
 """
 
+import dataclasses
 import functools
 from typing import NamedTuple
 
@@ -76,8 +77,11 @@ _at_limits = functools.partial(left_to_run, Hypothesis.LIMITS, NO_LIMIT)
 
 def from_starts(line: Statement, starts: Statement) -> Statement:
     """Return the line on limits of a run from its starts: from outside the set one may act."""
-    if line.verdict is not Verdict.HOLDS or not starts.fails:
+    if line.verdict is not Verdict.HOLDS:
         return line
+    if not starts.fails:
+        # What a run enters is known by that run.
+        return dataclasses.replace(line, kind=min(line.kind, starts.kind, key=lambda x: x.strength))
     text = "the starts are outside the certified set, where a limit may act"
     return _at_limits(text, starts.number, starts.number_text, starts.remedy, line.kind)
 

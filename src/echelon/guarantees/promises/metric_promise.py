@@ -10,7 +10,7 @@ import numpy as np
 
 from echelon.agents.models.linearization import at_trim
 from echelon.core.claim import Claim, ClaimKind, Number, Rounding
-from echelon.core.digits import about, at_most
+from echelon.core.digits import about, at_least, at_most
 from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array
@@ -29,6 +29,7 @@ from echelon.guarantees.promises.region import (
     adjacent_slopes,
     certified_set,
     domain_in_words,
+    entry,
     region_of,
     set_line,
     starts_line,
@@ -97,9 +98,10 @@ def _of_starts(
     region: RegionCertificate | None,
     certified: CertifiedSet | None,
     limits: Statement | None,
+    enters: float | None,
 ) -> list[Statement]:
     """Return what changes with the starts (N, n): whether they lie in the set, and limits act."""
-    starts = starts_line(parts, states, region, certified)
+    starts = starts_line(parts, states, region, certified, enters)
     return [starts] if limits is None else [from_starts(limits, starts), starts]
 
 
@@ -113,12 +115,14 @@ class MetricPromise(Guarantee):
 
     Attributes:
         limits: in how large a set no limit acts, whatever the starts; None without a region.
+        enters: when (s) a run from starts outside of the certified set enters it; None for never.
         turns: what the leader's heading may do, in words; empty where the law does not turn.
         slowest_turn: the slowest mode in the steady turns of `turns`, 1/s.
     """
 
     case: GuaranteeInputs
     limits: Statement | None = None
+    enters: float | None = None
     turns: str = ""
     slowest_turn: float = -math.inf
 
@@ -152,7 +156,8 @@ class MetricPromise(Guarantee):
             lines += [held_line(parts, settings, certificate)]
             certified = within(certified, radius)
         lines += [region.line, set_line(certificate, certified)]
-        lines += _of_starts(parts, states, certificate, certified, limits)
+        enters = None if brief else entry(parts, settings, states, certified)
+        lines += _of_starts(parts, states, certificate, certified, limits, enters)
         lines += [claims_line(parts, loop, region.relayed)]
         return cls(
             loop=loop,
@@ -164,6 +169,7 @@ class MetricPromise(Guarantee):
             domain="" if certificate is None else domain_in_words(parts, certificate),
             case=case,
             limits=limits,
+            enters=enters,
             turns=turns_in_words(case),
             slowest_turn=max(slowest_in_turns(case).values(), default=-math.inf),
         )
@@ -174,11 +180,14 @@ class MetricPromise(Guarantee):
             states = Starts(prepared.parts).of([each.seed for each in settings])
         for k, each in enumerate(settings):
             lines = dict(self.hypotheses)
-            own = self.region, self.certified, self.limits
-            changed = _of_starts(self.case.parts, states[k], *own)
+            parts, own = self.case.parts, (self.region, self.certified, self.limits)
+            enters = None if brief else entry(parts, each, states[k], self.certified)
+            changed = _of_starts(parts, states[k], *own, enters)
             lines |= {cast(Hypothesis, line.statement): line for line in changed}
             case = self.case._replace(settings=each)
-            yield dataclasses.replace(self, hypotheses=MappingProxyType(lines), case=case)
+            yield dataclasses.replace(
+                self, hypotheses=MappingProxyType(lines), case=case, enters=enters
+            )
 
     @property
     def governed(self) -> bool:
@@ -246,8 +255,12 @@ class MetricPromise(Guarantee):
         if math.isinf(certified.radius):
             return Claim(what, ("everywhere",), premises=premises)
         numbers = {"set_radius": Number(certified.radius, "", Rounding.DOWN)}
-        start = f"sum_i delta_i'P delta_i <= {at_most(certified.radius)}^2"
-        return Claim(what, (start,), premises=premises, numbers=numbers)
+        start = [f"sum_i delta_i'P delta_i <= {at_most(certified.radius)}^2"]
+        if self.enters is not None:
+            numbers["set_entered"] = Number(self.enters, "s", Rounding.UP)
+            start += [f"and from these starts, which reach that at {at_least(self.enters)} s"]
+            premises = ("until then the agents move as in a run from these starts", *premises)
+        return Claim(what, tuple(start), premises=premises, numbers=numbers)
 
     @property
     def edge(self) -> float | None:

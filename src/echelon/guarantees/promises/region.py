@@ -23,6 +23,8 @@ from echelon.core.words import Estimation, Feedforward, Kind, Theorem, Verdict
 from echelon.guarantees.promises.leaders import Leaders, excursion, own_paths, own_run
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
+from echelon.simulation.engine.result import Result
+from echelon.simulation.engine.simulate import simulate
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates.certificate import RegionCertificate
 from echelon.synthesis.certificates.domain import Domain
@@ -43,6 +45,10 @@ from echelon.synthesis.gains.gain import Gain
 _NAME = Hypothesis.REGION
 _INNER = "the hull is of the drift without the gain's inner loop", "remove the inner loop"
 _ROUNDED = 1e-9  # of a normalized input
+_SLACK = 0.01
+"""Of the radius of a set, within which a run that enters it has to be."""
+_FRAMES, _AGENT_STEPS = 4_000, 10_000_000
+"""Stored frames of a run into a set, and the most steps of all agents that it may take."""
 _NEAR = 1e-3
 """How far about a trim the slopes of its sides are looked at, in units of each state."""
 
@@ -360,13 +366,13 @@ def _constant(parts: Parts, region: RegionCertificate) -> bool:
     return has_constant_input_map(parts.model, region.domain)
 
 
-def size_of(parts: Parts, states: Array) -> float:
-    """Return r of the set {sum_i delta_i'P delta_i = r^2} on which states (N, n) lie."""
+def sizes_of(parts: Parts, states: Array) -> Array:
+    """Return r (...) of the sets {sum_i delta_i'P delta_i = r^2} on which states (..., N, n) lie."""
     gain = parts.drive.gain
     assert gain is not None
     y = states - parts.formation.offsets
-    delta = y - y[list(parts.graph.nearest_leader())]
-    return float(np.sqrt(np.einsum("ia,ab,ib->", delta, gain.P, delta)))
+    delta = y - y[..., list(parts.graph.nearest_leader()), :]
+    return np.sqrt(np.einsum("...ia,ab,...ib->...", delta, gain.P, delta))
 
 
 def set_line(region: RegionCertificate | None, certified: CertifiedSet | None) -> Statement:
@@ -386,17 +392,48 @@ def set_line(region: RegionCertificate | None, certified: CertifiedSet | None) -
     )
 
 
+def entry(
+    parts: Parts, settings: Settings, states: Array, certified: CertifiedSet | None
+) -> float | None:
+    """Return when (s) a run from states (N, n) outside of a set enters it; None where it does not.
+
+    A share of the radius is left for rounding.
+    """
+    if certified is None or not 0.0 < certified.radius < np.inf or not parts.world.ideal:
+        return None
+    many = settings.steps * len(states) > _AGENT_STEPS
+    if many or sizes_of(parts, states) <= certified.radius:
+        return None
+    stored = settings._replace(store_every=1 + settings.steps // _FRAMES, precision="float64")
+    result = simulate(parts.replace(initial=states, start_error={}), stored)
+    return entered(result, certified.radius * (1.0 - _SLACK))
+
+
+def entered(result: Result, radius: float) -> float | None:
+    """Return the time (s) of the first stored frame in a set of some radius; None without one."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        inside = np.flatnonzero(sizes_of(result.parts, result.states) <= radius)
+    return float(result.times[inside[0]]) if len(inside) else None
+
+
 def starts_line(
-    parts: Parts, states: Array, region: RegionCertificate | None, certified: CertifiedSet | None
+    parts: Parts,
+    states: Array,
+    region: RegionCertificate | None,
+    certified: CertifiedSet | None,
+    enters: float | None,
 ) -> Statement:
-    """Say whether starts (N, n) lie in the set."""
+    """Say whether starts (N, n) lie in the set, or a run from them `enters` it (s)."""
     if certified is None:
         return unneeded(Hypothesis.STARTS, Kind.PROOF, _no_set(region))
-    size = size_of(parts, states)
+    size = float(sizes_of(parts, states))
     number = size, f"{at_least(size)} of {at_most(certified.radius)}", certified.radius
     if size <= certified.radius:
         text = "no follower leaves the domain from these starts"
         return holds(Hypothesis.STARTS, certified.kind, text, *number)
+    if enters is not None:
+        text = f"a run from these starts enters the set at {at_least(enters)} s"
+        return holds(Hypothesis.STARTS, Kind.SAMPLES, text, *number)
     text, remedy = "the starts are outside the certified set", "start nearer to the goals"
     return fails(Hypothesis.STARTS, certified.kind, text, *number, remedy=remedy)
 
