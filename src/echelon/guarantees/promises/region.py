@@ -367,7 +367,7 @@ def _constant(parts: Parts, region: RegionCertificate) -> bool:
 
 
 def sizes_of(parts: Parts, states: Array) -> Array:
-    """Return r (...) of the sets {sum_i delta_i'P delta_i = r^2} on which states (..., N, n) lie."""
+    """Return r (...) of {sum_i delta_i'P delta_i = r^2}, on which states (..., N, n) lie."""
     gain = parts.drive.gain
     assert gain is not None
     y = states - parts.formation.offsets
