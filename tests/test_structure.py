@@ -253,6 +253,7 @@ IDEAL = (
     "echelon.agents.network.inbox",
     "echelon.simulation.engine.agent",
     "echelon.laws.law",
+    "echelon.agents.part",
 )
 
 

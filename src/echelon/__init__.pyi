@@ -18,10 +18,13 @@ from .agents.network.channel import Network as Network
 from .agents.network.formation import Formation as Formation
 from .agents.network.graph import Graph as Graph
 from .agents.network.inbox import Message as Message
+from .agents.part import Effects as Effects
+from .agents.part import WorldPart as WorldPart
 from .agents.references.reference import Reference as Reference
 from .agents.world.actuator import Actuator as Actuator
 from .agents.world.disturbance import Disturbance as Disturbance
 from .agents.world.sensing import Sensing as Sensing
+from .agents.world.sensing import SensorStage as SensorStage
 from .agents.world.world import World as World
 from .core import errors as errors
 from .core.errors import EchelonError as EchelonError

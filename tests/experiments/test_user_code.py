@@ -1,5 +1,6 @@
 """Users' own laws, references and gain methods in a scenario, and errors for bad ones."""
 
+import h5netcdf
 import numpy as np
 import pytest
 
@@ -195,3 +196,62 @@ def test_some_agents_start_by_the_spread_and_others_where_they_are_told(folder):
     run = ech.simulate(parts, settings)
     assert run.states[0, 2].tolist() == [3.0, 4.0]
     assert 0.0 < np.abs(run.states[0, 1]).max() <= 0.5
+
+
+PART = """
+import dataclasses
+import echelon as ech
+
+
+class Twice(ech.SensorStage):
+    def read(self, model, memory, x, clock, number):
+        return 2.0 * x, memory
+
+
+@dataclasses.dataclass(frozen=True)
+class Doubled(ech.WorldPart):
+    times: int = 2
+
+    def faults(self, model, agents):
+        if self.times != 2:
+            yield f"`times` of the sensor is {self.times}, and must be 2."
+
+    def member(self, loop):
+        return loop.with_sensor(Twice())
+
+    def ignored(self):
+        return "agents see double"
+
+    def variables(self, result):
+        return {"times": ((), self.times)}
+"""
+
+DOUBLED = """
+name: double
+model: {name: single-integrator, parameters: {dimension: 1}}
+graph: {name: path, agents: 2}
+parts: [{python: "double.py:Doubled"}]
+initial: {states: {1: [0.5]}}
+leader: {law: passive}
+simulation: {horizon: 1.0, dt: 0.1, integrator: euler}
+"""
+
+
+def test_a_part_of_the_world_in_one_file_says_all_about_itself(echelon, tmp_path):
+    (tmp_path / "double.py").write_text(PART)
+    (tmp_path / "s.yaml").write_text(DOUBLED)
+    code, out, _ = echelon("run", "s.yaml", "--no-figures", "--out", "o")
+    assert code == 0
+    run = ech.load(tmp_path / "o")
+    gain = run.drive.gain
+    factor = 1.0 - 0.1 * 2.0 * gain.coupling * float(gain.P[0, 0] / gain.R[0, 0])
+    assert run.states[-1, 1, 0] == pytest.approx(0.5 * factor**10)
+    assert "`Doubled` (times 2)" in (tmp_path / "o" / "report.txt").read_text()
+    with h5netcdf.File(tmp_path / "o" / "run.nc") as file:
+        assert file.variables["times"][()] == 2
+    code, _, err = echelon(
+        "run", "s.yaml", "--set", 'parts=[{python: "double.py:Doubled", times: 3}]'
+    )
+    assert code == 2 and "parts.0: `times` of the sensor is 3, and must be 2." in err
+    code, _, err = echelon("run", "s.yaml", "--set", 'parts=[{python: "double.py:Twice"}]')
+    assert code == 2 and "it has `Doubled`" in err

@@ -13,7 +13,7 @@ from in_words import in_words
 
 import echelon as ech
 from echelon.agents.network.channel import Channel
-from echelon.agents.world.sensing import Sensors, SensorStage
+from echelon.agents.world.sensing import SensorStage
 from echelon.core.errors import EchelonError
 from echelon.simulation.step.motion import IdealMotors
 
@@ -68,21 +68,44 @@ class GrowingSensor(SensorStage):
         return x, jnp.append(memory, 0.0)
 
 
-def sensed_by(stage):
-    return lambda loop: loop.replace(sensing=Sensors((*loop.sensing.stages, stage)))
+@dataclasses.dataclass(frozen=True)
+class Sensed(ech.WorldPart):
+    """One more stage of sensing."""
+
+    stage: object
+
+    def member(self, loop):
+        return loop.with_sensor(self.stage)
 
 
-def driven_by(motors):
-    return lambda loop: loop.replace(motion=dataclasses.replace(loop.motion, motors=motors))
+@dataclasses.dataclass(frozen=True)
+class Driven(ech.WorldPart):
+    """Other motors."""
+
+    motors: object
+
+    def member(self, loop):
+        return loop.with_motors(self.motors)
 
 
-def jammed(begins, ends):
-    def members(loop):
+@dataclasses.dataclass(frozen=True)
+class Jammed(ech.WorldPart):
+    """Another medium."""
+
+    begins: int
+    ends: int
+
+    def member(self, loop):
         medium = loop.network.medium
-        rows = jnp.asarray(begins), jnp.asarray(ends)
+        rows = jnp.asarray(self.begins), jnp.asarray(self.ends)
         return loop.with_medium(JammedMedium(**vars(medium), silent=rows[0], speaks=rows[1]))
 
-    return members
+
+class Returning(ech.WorldPart):
+    """Returns no loop."""
+
+    def member(self, loop):
+        return None
 
 
 def agreeing(**world):
@@ -111,13 +134,13 @@ def by_hand(sensed, strength):
 
 
 def test_a_sensor_that_measures_every_third_step():
-    run = flown(agreeing(members=sensed_by(SlowSensor())))
+    run = flown(agreeing(parts=[Sensed(SlowSensor())]))
     expected = by_hand(lambda k: k % 3 == 0, lambda k: 1.0)
     np.testing.assert_allclose(run.states[:, :, 0], expected, atol=1e-12)
 
 
 def test_motors_that_weaken():
-    run = flown(agreeing(members=driven_by(WeakeningMotors())))
+    run = flown(agreeing(parts=[Driven(WeakeningMotors())]))
     expected = by_hand(lambda k: True, lambda k: 0.98**k)
     np.testing.assert_allclose(run.states[:, :, 0], expected, atol=1e-12)
 
@@ -132,7 +155,7 @@ def test_a_medium_that_is_jammed_for_a_time(ends):
         ech.Settings(horizon=STEPS * DT, dt=DT, engine="jax"),
     )
     free = ech.simulate(parts, settings)
-    world = dataclasses.replace(parts.world, members=jammed(20, ends))
+    world = dataclasses.replace(parts.world, parts=[Jammed(20, ends)])
     run = ech.simulate(parts.replace(world=world), settings)
     same = np.array_equal(run.states, free.states)
     assert same == (ends == 20) and np.array_equal(run.states[:21], free.states[:21])
@@ -142,7 +165,7 @@ def test_a_medium_that_is_jammed_for_a_time(ends):
 
 
 def test_of_a_member_that_counts_steps_nothing_is_guaranteed_and_machine_code_lacks_it():
-    parts = agreeing(members=sensed_by(SlowSensor()))
+    parts = agreeing(parts=[Sensed(SlowSensor())])
     settings = ech.Settings(horizon=1.0, dt=DT)
     promised = ech.guarantee(parts, settings)
     assert str(promised.verdict) == "none"
@@ -155,13 +178,13 @@ def test_a_member_whose_memory_changes_its_form_is_told_with_its_line():
     line = 1 + pathlib.Path(__file__).read_text().split("class GrowingSensor")[0].count("\n")
     where = rf"test_own_members.py:{line}: the memory of `GrowingSensor` is .*\(3, 1\) at first"
     with pytest.raises(EchelonError, match=where):
-        flown(agreeing(members=sensed_by(GrowingSensor())))
-    with pytest.raises(EchelonError, match=r"test_own_members.py:\d+: `members` .* a `NoneType`"):
-        flown(agreeing(members=lambda loop: None))
-    broken = driven_by(None)
-    with pytest.raises(
-        EchelonError, match=r"test_own_members.py:\d+: the loop .* cannot take a step"
-    ):
-        flown(agreeing(members=broken))
-    with pytest.raises(EchelonError, match="`members` is a `int`"):
-        flown(agreeing(members=3))
+        flown(agreeing(parts=[Sensed(GrowingSensor())]))
+    with pytest.raises(EchelonError, match=r"test_own_members.py:\d+: `member` .* a `NoneType`"):
+        flown(agreeing(parts=[Returning()]))
+    broken = r"test_own_members.py:\d+: `member` of `Driven` fails, or its loop cannot take a step"
+    with pytest.raises(EchelonError, match=broken):
+        flown(agreeing(parts=[Driven(None)]))
+    with pytest.raises(EchelonError, match=r"`parts\[0\]` is a `int`, and must be a `WorldPart`"):
+        flown(agreeing(parts=[3]))
+    with pytest.raises(EchelonError, match="`parts` is a `int`, and must be a list"):
+        flown(agreeing(parts=3))

@@ -7,7 +7,7 @@ the others arrive, depends only on the seed, the message's number, its sender an
 import dataclasses
 import math
 from collections.abc import Callable, Mapping
-from typing import NamedTuple, final
+from typing import Any, NamedTuple, final
 
 import equinox as eqx
 import jax
@@ -15,11 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Int
 
+from echelon.agents.part import WorldPart
 from echelon.core.errors import SimulationError, check_kind, is_number
 from echelon.core.numerics import Draw, key_of, uniforms
 from echelon.core.types import Array, PyTree
 from echelon.core.words import MessageContent, NeighbourChoice, Prediction
 
+LATE = "messages are late or lost"
 _MOST = 2**30
 NEVER = -_MOST
 """The stamp of a message that never came, and the arrival of one that never does: before all steps,
@@ -44,7 +46,7 @@ class Bursts:
 
 @final
 @dataclasses.dataclass(frozen=True)
-class Network:
+class Network(WorldPart):
     """A network on which messages take time and are lost.
 
     Each agent sends one message to all that receive from it, `rate` times a second, and uses what
@@ -69,6 +71,8 @@ class Network:
     Raises:
         SimulationError: a number is out of its range.
     """
+
+    key = "network"
 
     rate: float = 50.0
     delay: float = 0.0
@@ -143,6 +147,43 @@ class Network:
             prediction=self.prediction,
             hears=self.hears,
         )
+
+    def ignored(self) -> str:
+        """Return that messages take time."""
+        return LATE
+
+    def presumed(self) -> str:
+        """Return of what messages theorems are."""
+        return "messages that arrive at once"
+
+    def told(self, result: Any) -> str:
+        """Return what a report says of it."""
+        whole = self.messages is MessageContent.DEVIATION and self.prediction is Prediction.PREVIEW
+        known = " Every agent knows the leader's whole plan before the start. "
+        known += "Messages only carry deviations from it, so few are needed."
+        traffic, messages = result.traffic, ""
+        if traffic is not None and traffic.sent:
+            messages = f" Messages: {traffic.sent} sent, {traffic.lost} lost"
+            messages += f", {traffic.late} arrived after a newer one" * (traffic.late > 0)
+            if np.isfinite(traffic.mean):
+                messages += f"; those in use were {1e3 * traffic.mean:.3g} ms old on average and "
+                messages += f"{1e3 * traffic.largest:.4g} ms at most"
+            messages += "."
+        return f"Network: {self}." + known * whole + messages
+
+    def variables(self, result: Any) -> dict[str, Any]:
+        """Return the ages of messages and which were lost, of each frame, link and end."""
+        traffic, seconds = result.traffic, {"units": "s"}
+        if traffic is None:
+            return {}
+        link = ("time", "edge", "end")
+        ages = traffic.of_agents(result.graph.edges, result.graph.agents, result.presence)
+        return {
+            "age": (("time", "agent"), ages, seconds),
+            "edge_age": (link, traffic.ages, seconds),
+            "edge_lost": (link, traffic.losses),
+            "forget": ((), self.forget, seconds),
+        }
 
     @property
     def information(self) -> str:

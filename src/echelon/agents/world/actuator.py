@@ -2,7 +2,8 @@
 
 import dataclasses
 import math
-from typing import final
+from collections.abc import Iterator
+from typing import Any, final
 
 import equinox as eqx
 import jax
@@ -11,13 +12,17 @@ import numpy as np
 from jaxtyping import Float
 
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.part import Effects, WorldPart
 from echelon.core.errors import SimulationError, is_number
 from echelon.core.types import Array, Input
+
+_SETTLES = 3.0
+"""Time constants after which an actuator has made 95 % of a step."""
 
 
 @final
 @dataclasses.dataclass(frozen=True)
-class Actuator:
+class Actuator(WorldPart):
     """How the actuators of all agents differ from ideal ones; the laws know nothing of it.
 
     Args:
@@ -30,6 +35,8 @@ class Actuator:
     Raises:
         SimulationError: a number is out of its range.
     """
+
+    key = "actuator"
 
     lag: float = 0.0
     levels: int = 0
@@ -46,6 +53,34 @@ class Actuator:
                 f"`levels` of the actuator is {self.levels}, and must be 0 for any value, or a "
                 "whole number from 2 on."
             )
+
+    def remarks(self, model: ControlAffine, horizon: float) -> Iterator[str]:
+        """Yield that the actuators are too slow for the horizon (s)."""
+        if _SETTLES * self.lag > horizon:
+            yield (
+                f"the actuators need {_SETTLES * self.lag:.3g} s for 95 % of a command, since "
+                f"their lag is {self.lag:.3g} s, and the horizon is {horizon:g} s."
+            )
+
+    def ignored(self) -> str:
+        """Return that inputs act late, or are others."""
+        return "" if self == Actuator() else "the actuators lag or have levels"
+
+    def unrested(self) -> str:
+        """Return that levels round the inputs at rest."""
+        return "the actuators have levels" if self.levels else ""
+
+    def presumed(self) -> str:
+        """Return of what inputs theorems are."""
+        return "inputs that act at once" if self.lag or self.levels else ""
+
+    def effects(self) -> Effects:
+        """Return the lag."""
+        return Effects(lag=self.lag)
+
+    def told(self, result: Any) -> str:
+        """Return what a report says of it."""
+        return f"Actuators: {self}; unknown to the laws."
 
     def prepared(self, plant: ControlAffine) -> "MotorArrays | None":
         """Return the actuators of a plant as arrays; None if they are ideal.

@@ -7,7 +7,7 @@ number of agents, the stored frames or the precision.
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import final
+from typing import Any, final
 
 import equinox as eqx
 import jax
@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.part import WorldPart
 from echelon.core.errors import ModelError, SimulationError, did_you_mean, is_number, listing
 from echelon.core.numerics import Draw, Field, key_of, normals
 from echelon.core.types import Array, Input, PyTree, State
@@ -23,7 +24,7 @@ from echelon.core.words import amount
 
 @final
 @dataclasses.dataclass(frozen=True)
-class Disturbance:
+class Disturbance(WorldPart):
     """xdot = f(x) + g(x) (u + S noise) + wind, with both held over a step as the input is.
 
     Args:
@@ -46,6 +47,8 @@ class Disturbance:
     Raises:
         SimulationError: a number is not finite, an rms is negative, or `hold` is not positive.
     """
+
+    key = "disturbance"
 
     constant: Mapping[str, float] = dataclasses.field(default_factory=dict)
     rms: Mapping[str, float] = dataclasses.field(default_factory=dict)
@@ -99,6 +102,20 @@ class Disturbance:
             raise SimulationError(
                 f"`seed` of the disturbance is {self.seed}, and must be a whole number from 0 on."
             )
+
+    def ignored(self) -> str:
+        """Return that wind acts."""
+        return "wind or noise acts on the agents"
+
+    unrested = ignored
+
+    def presumed(self) -> str:
+        """Return nothing: agents in wind are the same agents."""
+        return ""
+
+    def told(self, result: Any) -> str:
+        """Return what a report says of it."""
+        return f"Disturbance: {self}; unknown to the laws."
 
     def __str__(self) -> str:
         parts = [

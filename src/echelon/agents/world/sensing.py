@@ -4,7 +4,7 @@ import abc
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import ClassVar, NamedTuple, Protocol, final
+from typing import Any, ClassVar, NamedTuple, Protocol, final
 
 import equinox as eqx
 import jax
@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from echelon.agents.models.linearization import linearize
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.part import Effects, WorldPart
 from echelon.core.errors import SimulationError, is_number
 from echelon.core.linear import discretize
 from echelon.core.numerics import Draw, key_of, normals, rk4
@@ -126,7 +127,7 @@ class Estimator(eqx.Module):
 
 @final
 @dataclasses.dataclass(frozen=True)
-class Sensing:
+class Sensing(WorldPart):
     """How all agents measure their own states; laws and messages use nothing else.
 
     Args:
@@ -141,6 +142,8 @@ class Sensing:
     Raises:
         SimulationError: a number is not finite, or negative; or exact states are to be estimated.
     """
+
+    key = "sensing"
 
     delay: float = 0.0
     noise: Mapping[str, float] = dataclasses.field(default_factory=dict)
@@ -185,6 +188,27 @@ class Sensing:
         if stages and self.estimator is Estimation.CONSTANT_GAIN:
             stages.append(EstimatingSensor(Estimator.of(model, std, late, dt)))
         return Sensors(tuple(stages))
+
+    def ignored(self) -> str:
+        """Return that states are not exact."""
+        return "" if self == Sensing() else "agents measure their states late or with noise"
+
+    def unrested(self) -> str:
+        """Return that noise keeps agents from rest."""
+        return "agents measure their states with noise" if any(self.noise.values()) else ""
+
+    def presumed(self) -> str:
+        """Return of what states theorems are."""
+        late = self.delay or self.estimator is not Estimation.NONE
+        return "agents that know their states now" if late else ""
+
+    def effects(self) -> Effects:
+        """Return the delay, and whether it is estimated away."""
+        return Effects(self.delay, estimated=self.estimator is not Estimation.NONE)
+
+    def told(self, result: Any) -> str:
+        """Return what a report says of it."""
+        return f"Sensing of own states: {self}."
 
     def __str__(self) -> str:
         parts = [f"{1e3 * self.delay:g} ms late"] if self.delay else []

@@ -2,7 +2,7 @@
 
 import dataclasses
 import numbers
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, final
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
 from echelon.agents.network.channel import Network
+from echelon.agents.part import Effects, WorldPart
 from echelon.agents.world.actuator import Actuator
 from echelon.agents.world.disturbance import Disturbance
 from echelon.agents.world.sensing import Sensing
@@ -106,7 +107,53 @@ def _format_value(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, numbers.Real) else str(value)
 
 
-LATE = "messages are late or lost"
+@final
+@dataclasses.dataclass(frozen=True)
+class Plants(WorldPart):
+    """Agents that move unlike the model: the plant of all, and those of single agents."""
+
+    key = "plant"
+
+    plant: ControlAffine | None
+    plants: Mapping[int, ControlAffine]
+
+    def ignored(self) -> str:
+        """Return that agents are others."""
+        return "the agents differ from the model"
+
+    def presumed(self) -> str:
+        """Return of what agents theorems are."""
+        return "agents that move as the model says"
+
+    def effects(self) -> Effects:
+        """Return that agents are others."""
+        return Effects(other_agents=True)
+
+    def faults(self, model: ControlAffine, agents: int) -> Iterator[str]:
+        """Yield that there is no such agent, or that its plant is of another class."""
+        kind = type(model if self.plant is None else self.plant)
+        for k, plant in self.plants.items():
+            if not 0 <= k < agents:
+                yield f"got a plant for agent {k}, and the agents are 0 to {agents - 1}."
+            elif type(plant) is not kind:
+                yield (
+                    f"the plant of agent {k} is a `{type(plant).__name__}`, and must be a "
+                    f"`{kind.__name__}` as those of the others."
+                )
+
+    def words(self, model: ControlAffine) -> str:
+        """Return in words how they differ from the model."""
+        plants = [] if self.plant is None else [differences(model, self.plant)]
+        plants += [f"agent {k}: {differences(model, x)}" for k, x in sorted(self.plants.items())]
+        return "; ".join(plants)
+
+    def told(self, result: Any) -> str:
+        """Return what a report says of them."""
+        return f"Plant: {self.words(result.model)}; laws and gains use the model's values."
+
+
+KEYS = "plant", "disturbance", "network", "actuator", "sensing"
+"""The sections of a scenario that are parts of a world."""
 
 
 @final
@@ -121,9 +168,7 @@ class World:
         actuator: lag and levels of all agents' actuators; left out, inputs act at once.
         sensing: delay and noise of what agents measure of themselves; left out, it is exact.
         plants: of single agents, by number, where they differ from the others.
-        members: a function that returns the loop of a run with other members of its components, a
-            sensor or a medium of your own, for example (page on extending). Nothing is guaranteed
-            of them.
+        parts: of your own, such as a sensor or a medium (page on extending).
     """
 
     plant: ControlAffine | None = None
@@ -132,35 +177,44 @@ class World:
     actuator: Actuator | None = None
     sensing: Sensing | None = None
     plants: Mapping[int, ControlAffine] = dataclasses.field(default_factory=dict)
-    members: Callable[[Any], Any] | None = None
+    parts: Sequence[WorldPart] = ()
+
+    @property
+    def all_parts(self) -> tuple[WorldPart, ...]:
+        """The parts that are there; yours come last."""
+        unlike = self.plant is not None or bool(self.plants)
+        plants = Plants(self.plant, self.plants) if unlike else None
+        known = self.disturbance, plants, self.network, self.actuator, self.sensing
+        return (*(part for part in known if part is not None), *self.parts)
 
     @property
     def ideal(self) -> bool:
         """Whether the agents are as the model says, undisturbed, and the network is ideal."""
-        return not any(self.differences.values())
+        return not (self.ignored or self.parts)
 
     @property
-    def differences(self) -> dict[str, bool]:
-        """What no law knows and no promise covers, in words, and whether it is there."""
-        return {
-            "wind or noise acts on the agents": self.disturbance is not None,
-            "the agents differ from the model": self.plant is not None or bool(self.plants),
-            LATE: self.network is not None,
-            "the actuators lag or have levels": self.actuator not in (None, Actuator()),
-            "agents measure their states late or with noise": self.sensing not in (None, Sensing()),
-            "the step has members of your own": self.members is not None,
-        }
+    def ignored(self) -> tuple[str, ...]:
+        """What theorems of the ideal world leave out, a phrase each."""
+        return tuple(filter(None, (part.ignored() for part in self.all_parts)))
 
     @property
-    def random(self) -> dict[str, bool]:
-        """What is left out of the steps at rest, in words, and whether it is there."""
-        levels = self.actuator is not None and self.actuator.levels > 0
-        noisy = self.sensing is not None and any(self.sensing.noise.values())
-        return {
-            "wind or noise acts on the agents": self.disturbance is not None,
-            "the actuators have levels": levels,
-            "agents measure their states with noise": noisy,
-        }
+    def unrested(self) -> tuple[str, ...]:
+        """What the steps at rest leave out, a phrase each."""
+        return tuple(filter(None, (part.unrested() for part in self.all_parts)))
+
+    @property
+    def presumed(self) -> str:
+        """Of what agents theorems are, where these are others; empty where they are not."""
+        asked = *self.parts, *self.all_parts
+        return next(filter(None, (part.presumed() for part in asked)), "")
+
+    @property
+    def effects(self) -> Effects:
+        """What theorems may bound of all parts."""
+        each = [part.effects() for part in self.all_parts]
+        delay, lag = (sum(getattr(x, name) for x in each) for name in ("delay", "lag"))
+        estimated, other = (any(getattr(x, name) for x in each) for name in Effects._fields[2:])
+        return Effects(delay, lag, estimated, other)
 
     def plant_for(self, model: ControlAffine) -> ControlAffine:
         """Return the plant, or the model if there is none."""
@@ -179,16 +233,16 @@ class World:
             "actuator": Actuator,
             "sensing": Sensing,
         }
-        for name, kind in kinds.items():
-            part = getattr(self, name)
+        named = [(name, getattr(self, name), kind) for name, kind in kinds.items()]
+        if not isinstance(self.parts, Sequence):
+            kind = type(self.parts).__name__
+            raise SimulationError(f"`parts` is a `{kind}`, and must be a list of `WorldPart`.")
+        named += [(f"parts[{k}]", part, WorldPart) for k, part in enumerate(self.parts)]
+        for name, part, kind in named:
             if part is not None and not isinstance(part, kind):
                 raise SimulationError(
                     f"`{name}` is a `{type(part).__name__}`, and must be a `{kind.__name__}`."
                 )
-        if not (self.members is None or callable(self.members)):
-            raise SimulationError(
-                f"`members` is a `{type(self.members).__name__}`, and must be a function of a loop."
-            )
         warnings = tuple[str, ...]()
         for plant in (self.plant, *self.plants.values()):
             if plant is not None:
@@ -198,28 +252,16 @@ class World:
         return warnings
 
     def check_agents(self, model: ControlAffine, agents: int) -> None:
-        """Check the plants of single agents.
-
-        Raises:
-            SimulationError: there is no such agent, or a plant is of another class.
-        """
-        kind = type(self.plant_for(model))
-        for k, plant in self.plants.items():
-            if not 0 <= k < agents:
-                raise SimulationError(
-                    f"got a plant for agent {k}, and the agents are 0 to {agents - 1}."
-                )
-            if type(plant) is not kind:
-                raise SimulationError(
-                    f"the plant of agent {k} is a `{type(plant).__name__}`, and must be a "
-                    f"`{kind.__name__}` as those of the others."
-                )
+        """Raise `SimulationError` with what does not fit the model or the number of agents."""
+        for part in self.all_parts:
+            for fault in part.faults(model, agents):
+                raise SimulationError(fault)
 
     def describe(self, model: ControlAffine) -> dict[str, str | None]:
-        """Return each part in words; None for each that is absent."""
-        plants = [] if self.plant is None else [differences(model, self.plant)]
-        plants += [f"agent {k}: {differences(model, x)}" for k, x in sorted(self.plants.items())]
-        names = "disturbance", "network", "actuator", "sensing"
-        parts = {name: getattr(self, name) for name in names}
-        words = {name: None if part is None else str(part) for name, part in parts.items()}
-        return {"plant": "; ".join(plants) or None, **words}
+        """Return each part in words by its key; None for each that is absent.
+
+        Parts of your own are joined under `parts`, where there are any.
+        """
+        words = {part.key: part.words(model) or None for part in self.all_parts if part.key}
+        own = "; ".join(part.words(model) for part in self.parts)
+        return {**dict.fromkeys(KEYS), **words, **({"parts": own} if own else {})}

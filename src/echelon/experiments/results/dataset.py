@@ -135,7 +135,9 @@ def _labelled(result: Result) -> Labelled:
     variables |= _followed(result)
     if result.formation.motion is not None:
         variables["moving_offset"] = (per_agent, result.offsets_in())
-    variables |= {**_poles(result), **_messages(result)}
+    variables |= _poles(result)
+    for part in result.world.all_parts:
+        variables |= part.variables(result)
     kept = avoidance(result)
     if kept is not None:
         variables["slice_start"] = ("slice", kept.times, _SECONDS)
@@ -158,20 +160,6 @@ def _followed(result: Result) -> Variables:
     if errors:
         variables["tracking_error"] = (("time", "leader", "output"), np.stack(errors, axis=1))
     return variables
-
-
-def _messages(result: Result) -> Variables:
-    network, traffic = result.world.network, result.traffic
-    if network is None or traffic is None:
-        return {}
-    link = ("time", "edge", "end")
-    ages = traffic.of_agents(result.graph.edges, result.graph.agents, result.presence)
-    return {
-        "age": (("time", "agent"), ages, _SECONDS),
-        "edge_age": (link, traffic.ages, _SECONDS),
-        "edge_lost": (link, traffic.losses),
-        "forget": ((), network.forget, _SECONDS),
-    }
 
 
 def _poles(result: Result) -> Variables:

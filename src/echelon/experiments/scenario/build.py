@@ -13,6 +13,7 @@ from echelon.agents.network.events import Cut, Event, Join, Lose, check_backups,
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.formation_motion import OffsetMotion, Reshape, Rotate, Scale
 from echelon.agents.network.graph import Graph
+from echelon.agents.part import WorldPart
 from echelon.agents.references.reference import LeaderPath, Reference, check_reference
 from echelon.agents.references.slowed_path import slowed
 from echelon.agents.world.actuator import Actuator
@@ -438,7 +439,16 @@ class _Builder:
             checked("actuator", Actuator, model),
             checked("sensing", Sensing, model, dt, horizon, 0),
             plants,
+            tuple(own for k, spec in enumerate(scenario.parts) for own in self._own_part(k, spec)),
         )
+
+    def _own_part(self, k: int, spec: UserClass) -> Iterator[WorldPart]:
+        """Yield a part of the user's, unless its fault is noted."""
+        with self.at("parts", k):
+            part = self._class(WorldPart, {}, None, spec.python, spec.parameters).create()
+            for fault in part.faults(self.model, self.graph.agents):
+                raise ScenarioError(fault)
+            yield part
 
     def _plants(self) -> tuple[ControlAffine | None, dict[int, ControlAffine]]:
         """Return the agents that move, where they differ from the model: all, and single ones."""

@@ -57,6 +57,8 @@ class Scenario(Section):
     actuator: sections.ActuatorSpec | None = None
     sensing: sections.SensingSpec | None = None
     network: sections.NetworkSpec | None = None
+    parts: Annotated[tuple[sections.UserClass, ...], Field(strict=False)] = ()
+    """Parts of the world of your own, as in `[{python: "slow.py:SlowSensor", every: 3}]`."""
     events: Annotated[tuple[sections.EventSpec, ...], Field(strict=False)] = ()
     """What happens during the run, as in `[{at: 8.0, lose: 3}, {at: 12.0, join: 3}]`: agents are
     lost or join, and links are cut, as in `[{at: 8.0, cut: [1, 2], for: 3.0}]`."""

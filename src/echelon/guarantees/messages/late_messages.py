@@ -489,8 +489,7 @@ def bias_line(parts: Parts, settings: Settings) -> Statement | None:
 
 
 def _swinging_line(parts: Parts) -> Statement | None:
-    actuator, graph = parts.world.actuator, parts.graph
-    lag = 0.0 if actuator is None else actuator.lag
+    lag, graph = parts.world.effects.lag, parts.graph
     if parts.world.network is None or not lag or graph.directed:
         return None
     text = "agents with motors that lag hear each other late and both ways, and may swing up"

@@ -19,7 +19,7 @@ from echelon.core.compiled import cached_jit
 from echelon.core.digits import about, at_most
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array
-from echelon.core.words import Estimation, Kind
+from echelon.core.words import Kind
 from echelon.laws.law import LocalView
 from echelon.laws.stopping_point import StoppingPoint
 from echelon.simulation.step.assembly import assemble
@@ -204,9 +204,8 @@ class OwnCase(NamedTuple):
 
 def own_delay_line(case: OwnCase) -> Statement | None:
     """Return how late own states may be; None where they are exact and motors are quick."""
-    dt, world = case.problem.settings.dt, case.world
-    lag = 0.0 if world.actuator is None else world.actuator.lag
-    delay = 0 if world.sensing is None else round(world.sensing.delay / dt)
+    dt, effects = case.problem.settings.dt, case.world.effects
+    lag, delay = effects.lag, round(effects.delay / dt)
     if not lag and not delay:
         return None
     name, kind = Hypothesis.OWN_STATE, Kind.LINEARIZATION
@@ -215,10 +214,11 @@ def own_delay_line(case: OwnCase) -> Statement | None:
         return unneeded(name, kind, text)
     step = late_step(case.problem, case.law, lag)
     text = f"own state {about(1e3 * delay * dt)} ms late, " * bool(delay)
-    estimated = world.sensing is not None and world.sensing.estimator is not Estimation.NONE
-    text += f"lag {about(1e3 * lag)} ms, " * bool(lag) + "without the estimator, " * estimated
+    text += (
+        f"lag {about(1e3 * lag)} ms, " * bool(lag) + "without the estimator, " * effects.estimated
+    )
     text += f"inputs held for {about(1e3 * dt)} ms: "
-    if world.plant is not None or world.plants:
+    if effects.other_agents:
         text += "for agents as in the model, unlike these plants, "
     if step is None:
         return unneeded(name, kind, f"{text}the model has no linearization at its trim")

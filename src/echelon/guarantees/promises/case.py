@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from echelon.agents.models.linearization import at_trim
 from echelon.agents.models.straight_range import is_straight
-from echelon.agents.world.world import LATE
+from echelon.agents.network.channel import LATE
 from echelon.core.types import Array
 from echelon.core.words import Feedforward
 from echelon.guarantees.local.local_certificate import LocalCertificate
@@ -85,9 +85,8 @@ class GuaranteeInputs(NamedTuple):
     def ignored(self) -> tuple[str, ...]:
         """What acts that no guarantee covers, a phrase each."""
         world = self.parts.world
-        acts = world.differences if self.local is None else world.random
-        acting = [text for text, there in acts.items() if there]
-        acting = [x for x in acting if not (self.over_network and x == LATE)]
+        acts = world.ignored if self.local is None else world.unrested
+        acting = [x for x in acts if not (self.over_network and x == LATE)]
         # Far from 0 its numbers are centimetres apart, whatever a law does.
         acting += ["numbers have single precision"] * (self.settings.precision == "float32")
         return tuple(acting)

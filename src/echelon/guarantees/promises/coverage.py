@@ -37,7 +37,8 @@ def coverage(result: Result, promise: Guarantee) -> Iterator[str]:
     if against:
         yield f"The {what} does not cover this run: {against}."
     elif inside:
-        yield f"The {what} covers this run: all agents were in the certified set at {inside:.4g} s."
+        when = about(inside, 4)
+        yield f"The {what} covers this run: all agents were in the certified set at {when} s."
     else:
         yield f"The {what} covers this run: {promise.why_covered()}."
 

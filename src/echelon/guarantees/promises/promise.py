@@ -304,7 +304,8 @@ def unknown_in(parts: Parts) -> str:
     """Return what of the parts echelon does not know, in words; empty without anything."""
     if parts.drive.unknown:
         return f"the law `{parts.drive.unknown}`"
-    return "" if parts.world.members is None else "all members of the step"
+    own = any(part.presumed() for part in parts.world.parts)
+    return "all members of the step" if own else ""
 
 
 @shared_traces()

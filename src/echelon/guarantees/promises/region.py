@@ -19,7 +19,7 @@ from echelon.core.digits import about, at_least, at_most
 from echelon.core.errors import GainError
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array
-from echelon.core.words import Estimation, Feedforward, Kind, Theorem, Verdict
+from echelon.core.words import Feedforward, Kind, Theorem, Verdict
 from echelon.guarantees.promises.leaders import Leaders, excursion, own_paths, own_run
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
@@ -101,19 +101,9 @@ _LEAVE_OUT = "leave out of the world what differs from that"
 
 def _other_agents(parts: Parts) -> str:
     """Return what a theorem is about, where the agents that run are others; empty where not."""
-    world = parts.world
-    if parts.drive.unknown or world.members is not None:
+    if parts.drive.unknown:
         return "echelon's own laws and members of a step"
-    if world.plant is not None or world.plants:
-        return "agents that move as the model says"
-    if world.network is not None:
-        return "messages that arrive at once"
-    if world.actuator is not None and (world.actuator.lag or world.actuator.levels):
-        return "inputs that act at once"
-    sensing = world.sensing
-    if sensing is not None and (sensing.delay or sensing.estimator is not Estimation.NONE):
-        return "agents that know their states now"
-    return ""
+    return parts.world.presumed
 
 
 def _region_at_bend(parts: Parts, settings: Settings, leaders: Leaders, gain: Gain) -> Region:

@@ -17,7 +17,7 @@ from echelon.core.digits import at_least
 from echelon.core.errors import Outcome
 from echelon.core.statement import Hypothesis
 from echelon.core.types import JsonObject
-from echelon.core.words import MessageContent, Prediction, amount
+from echelon.core.words import amount
 from echelon.experiments.results.event_outcomes import event_outcomes
 from echelon.experiments.results.lyapunov import lyapunov
 from echelon.experiments.results.metrics import avoidance, metrics
@@ -306,47 +306,8 @@ def _lag(result: Result) -> Iterator[str]:
 
 
 def _world(result: Result) -> Iterator[str]:
-    world = result.world.describe(result.model)
-    if world["plant"]:
-        yield f"Plant: {world['plant']}; laws and gains use the model's values."
-    if world["disturbance"]:
-        yield f"Disturbance: {world['disturbance']}; unknown to the laws."
-    if world["network"]:
-        yield f"Network: {world['network']}."
-        if _is_known(result):
-            yield (
-                "Every agent knows the leader's whole plan before the start. Messages only carry "
-                "deviations from it, so few are needed."
-            )
-        yield from _messages(result)
-    if world["actuator"]:
-        yield f"Actuators: {world['actuator']}; unknown to the laws."
-    if world["sensing"]:
-        yield f"Sensing of own states: {world['sensing']}."
-
-
-def _is_known(result: Result) -> bool:
-    """Return whether everybody knows where the leader will be, whatever messages are lost."""
-    network = result.world.network
-    return (
-        network is not None
-        and network.prediction is Prediction.PREVIEW
-        and network.messages is MessageContent.DEVIATION
-    )
-
-
-def _messages(result: Result) -> Iterator[str]:
-    traffic = result.traffic
-    if traffic is None or not traffic.sent:
-        return
-    late = f", {traffic.late} arrived after a newer one" * (traffic.late > 0)
-    ages = ""
-    if np.isfinite(traffic.mean):
-        ages = (
-            f"; those in use were {1e3 * traffic.mean:.3g} ms old on average and "
-            f"{1e3 * traffic.largest:.4g} ms at most"
-        )
-    yield f"Messages: {traffic.sent} sent, {traffic.lost} lost{late}{ages}."
+    for part in result.world.all_parts:
+        yield part.told(result)
 
 
 def _reach(result: Result, guarantee: Guarantee) -> Iterator[str]:

@@ -201,7 +201,7 @@ def _job(case: _SharedRun, place: int, settings: Settings, states: Array) -> _Ba
         problem = problem._replace(motion=motion, channel=channel, sensors=sensors)
         loop = loop.replace(motion=motion, sensing=sensors)
         loop = loop if channel is None else loop.with_medium(channel)
-        if world.members is not None:
+        if world.parts:
             drive: Any = prepared.parts.drive
             loop = assemble(problem, drive.leader, drive.follower)
     return _BatchJob(place, prepared._replace(problem=problem), loop)

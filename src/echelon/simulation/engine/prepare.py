@@ -107,7 +107,7 @@ def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
             channel,
             sensors_of(parts, settings),
             parts.leadership,
-            parts.world.members,
+            parts.world.parts,
         )
         parts.drive.accept(problem)
         warnings += parts.drive.warnings(model, graph, settings)
@@ -183,8 +183,6 @@ _MET = 1e-9
 """m; agents without a radius that come so near to each other meet."""
 _COARSE = 1e-3
 """m; a run whose positions are not resolved to this is warned of."""
-_SETTLES = 3.0
-"""Time constants after which an actuator has made 95 % of a step."""
 
 
 def part_warnings(parts: Parts, states: Array, settings: Settings) -> Iterator[str]:
@@ -203,12 +201,8 @@ def part_warnings(parts: Parts, states: Array, settings: Settings) -> Iterator[s
     yield from _starts(parts.model, states)
     yield from _spreads(parts)
     yield from _coarse(parts.model, states, settings)
-    actuator, horizon = parts.world.actuator, settings.horizon
-    if actuator is not None and _SETTLES * actuator.lag > horizon:
-        yield (
-            f"the actuators need {_SETTLES * actuator.lag:.3g} s for 95 % of a command, since "
-            f"their lag is {actuator.lag:.3g} s, and the horizon is {horizon:g} s."
-        )
+    for part in parts.world.all_parts:
+        yield from part.remarks(parts.model, settings.horizon)
 
 
 def _coarse(model: ControlAffine, states: Array, settings: Settings) -> Iterator[str]:

@@ -80,7 +80,7 @@ def traffic(parts: Parts, settings: Settings, times: Array, steps: int) -> Traff
         leadership = leaders_of(graph, parts.leadership)
         rules = MessageRules.of(channel, leadership, graph.agents)
         network, roster = LateNetwork(leadership, rules, channel), roster_of(graph, settings, False)
-        if parts.world.members is not None:
+        if parts.world.parts:
             drive: Any = parts.drive
             problem = prepare(parts, settings).problem
             own = assemble(problem, drive.leader, drive.follower).network

@@ -4,8 +4,8 @@
 """
 
 import abc
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.channel import Channel
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
+from echelon.agents.part import WorldPart
 from echelon.agents.world.sensing import Sensors
 from echelon.agents.world.world import World
 from echelon.core.errors import SimulationError
@@ -49,7 +50,7 @@ class Problem(NamedTuple):
         channel: what the network does to messages; None for the ideal network.
         sensors: of the agents' own states.
         leadership: who takes the lead after the leader; None for nobody.
-        members: what replaces members of the loop; None for nothing.
+        parts: of the world, which replace members of the loop.
     """
 
     model: ControlAffine
@@ -62,7 +63,7 @@ class Problem(NamedTuple):
     channel: Channel | None = None
     sensors: Sensors = Sensors()
     leadership: Leadership | None = None
-    members: Callable[[Any], Any] | None = None
+    parts: Sequence[WorldPart] = ()
 
 
 class Chunk(NamedTuple):

@@ -16,11 +16,11 @@ from jaxtyping import Float
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.channel import Channel
 from echelon.agents.network.exchange import Near
-from echelon.agents.world.sensing import Sensors
+from echelon.agents.world.sensing import Sensors, SensorStage
 from echelon.core.types import PyTree, States
 from echelon.simulation.step.leadership import FixedLeaders
 from echelon.simulation.step.meter import RunStatistics, Sums
-from echelon.simulation.step.motion import PlantStep
+from echelon.simulation.step.motion import IdealMotors, PlantStep
 from echelon.simulation.step.places import FixedPlaces
 from echelon.simulation.step.records import (
     Known,
@@ -143,6 +143,14 @@ class Loop(eqx.Module):
     def replace(self, **members: eqx.Module) -> "Loop":
         """Return the loop with other members."""
         return dataclasses.replace(self, **members)
+
+    def with_sensor(self, stage: SensorStage) -> "Loop":
+        """Return the loop with one more stage between its agents' states and what they know."""
+        return self.replace(sensing=Sensors((*self.sensing.stages, stage)))
+
+    def with_motors(self, motors: IdealMotors) -> "Loop":
+        """Return the loop with other motors."""
+        return self.replace(motion=dataclasses.replace(self.motion, motors=motors))
 
     def with_medium(self, medium: Channel) -> "Loop":
         """Return the loop with another medium of its messages, if they take one."""

@@ -8,6 +8,7 @@ import jax
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.formation_motion import FormationMotion
+from echelon.agents.part import WorldPart
 from echelon.core.errors import SimulationError
 from echelon.core.trace import form_in_words, form_of, place_of
 from echelon.simulation.step.drive import Problem
@@ -22,29 +23,36 @@ _LAWS = {"model", "laws", "meter"}
 
 
 def with_own_members(loop: Loop, problem: Problem) -> Loop:
-    """Return a loop with the members that a world replaces.
+    """Return a loop with the members that the parts of a world replace.
 
     Raises:
-        SimulationError: its function returns no loop, or one whose members fail or change the form
-            of their memory.
+        SimulationError: a part returns no loop, or one whose members fail or change the form of
+            their memory.
     """
-    if problem.members is None:
-        return loop
-    changed = problem.members(loop)
-    if not isinstance(changed, Loop):
-        raise SimulationError(
-            f"{place_of(problem.members)}: `members` of the world returns a "
-            f"`{type(changed).__name__}`, and must return the loop: `return loop.replace(..)`."
-        )
+    for part in problem.parts:
+        loop = _with_members_of(part, loop, problem)
+    return loop
+
+
+def _with_members_of(part: WorldPart, loop: Loop, problem: Problem) -> Loop:
+    kind = type(part)
+    where = f"{place_of(kind)}: `member` of `{kind.__name__}`"
     try:
+        changed = part.member(loop)
+        if not isinstance(changed, Loop):
+            raise SimulationError(
+                f"{where} returns a `{type(changed).__name__}`, and must return the loop: "
+                "`return loop.replace(..)`."
+            )
         begun = jax.eval_shape(lambda states: begin(changed, states), problem.states)
         moved = jax.eval_shape(lambda now: step(changed, now), begun)
+    except SimulationError:
+        raise
     # It is anyone's code: whatever it raises is its own fault, and stays attached as the cause.
     except Exception as error:
         words = (str(error).splitlines() or ["no message"])[0].rstrip(".")
         raise SimulationError(
-            f"{place_of(problem.members)}: the loop that `members` of the world returns cannot "
-            f"take a step ({type(error).__name__}: {words})."
+            f"{where} fails, or its loop cannot take a step ({type(error).__name__}: {words})."
         ) from error
     names = ComponentMemory._fields
     for name, first, last in zip(names, begun.memory, moved.memory, strict=True):

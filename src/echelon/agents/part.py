@@ -1,0 +1,78 @@
+"""What acts on agents and messages and no law knows: a part of the world says all about itself."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+from echelon.agents.models.model import ControlAffine
+
+
+class Effects(NamedTuple):
+    """What a theorem may bound of parts of the world; as they are here, there is nothing to bound.
+
+    Attributes:
+        delay: of what agents know of their own states, s.
+        lag: of the actuators, s.
+        estimated: whether agents estimate their states.
+        other_agents: whether agents move unlike the model.
+    """
+
+    delay: float = 0.0
+    lag: float = 0.0
+    estimated: bool = False
+    other_agents: bool = False
+
+
+class WorldPart:
+    """A part of the world, such as wind, a sensor or a radio; laws and gains know nothing of it.
+
+    All others ask a part about itself here. One that overrides `member` alone runs, and no theorem
+    covers it. The local certificate is of the step that runs, with all its members.
+    """
+
+    key: str = ""
+    """Its section of a scenario; empty for a class of yours."""
+
+    def faults(self, model: ControlAffine, agents: int) -> Iterator[str]:
+        """Yield a sentence for each thing that does not fit the model or the number of agents."""
+        yield from ()
+
+    def remarks(self, model: ControlAffine, horizon: float) -> Iterator[str]:
+        """Yield a sentence for what is allowed and probably not meant; the horizon in s."""
+        yield from ()
+
+    def member(self, loop: Any) -> Any:
+        """Return a loop with what runs: other members of its components."""
+        return loop
+
+    def ignored(self) -> str:
+        """Return what theorems of the ideal world leave out, a phrase; empty for nothing."""
+        return f"`{type(self).__name__}` acts"
+
+    def unrested(self) -> str:
+        """Return what the steps at rest leave out, a phrase, such as what is random."""
+        return ""
+
+    def presumed(self) -> str:
+        """Return of what agents theorems are, where this makes them others; empty for none."""
+        return "echelon's own laws and members of a step"
+
+    def effects(self) -> Effects:
+        """Return what theorems may bound of it."""
+        return Effects()
+
+    def words(self, model: ControlAffine) -> str:
+        """Return it in words, for data."""
+        return str(self)
+
+    def told(self, result: Any) -> str:
+        """Return what a report says of it, in sentences."""
+        return f"{(self.key or 'a part of your own').capitalize()}: {self.words(result.model)}."
+
+    def variables(self, result: Any) -> Mapping[str, Any]:
+        """Return what it adds to the labelled data of a run, by name, as xarray takes it."""
+        return {}
+
+    def __str__(self) -> str:
+        own = {k: v for k, v in vars(self).items() if not k.startswith("_")}
+        listed = ", ".join(f"{name} {value}" for name, value in own.items())
+        return f"`{type(self).__name__}`" + f" ({listed})" * bool(listed)
