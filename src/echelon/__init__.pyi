@@ -14,6 +14,7 @@ from .agents import (
 )
 from .agents.models.model import ControlAffine as ControlAffine
 from .agents.network.channel import Bursts as Bursts
+from .agents.network.channel import Channel as Channel
 from .agents.network.channel import Network as Network
 from .agents.network.formation import Formation as Formation
 from .agents.network.graph import Graph as Graph
@@ -83,6 +84,7 @@ from .simulation.engine.parts import Parts as Parts
 from .simulation.engine.result import Result as Result
 from .simulation.engine.simulate import simulate as simulate
 from .simulation.step.leadership import Leadership as Leadership
+from .simulation.step.motion import IdealMotors as IdealMotors
 from .simulation.step.settings import Settings as Settings
 from .synthesis import (
     certificates as certificates,

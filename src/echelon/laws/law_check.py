@@ -60,7 +60,16 @@ def _check_law(law: Law, model: ControlAffine) -> None:
             f"`feedforward` of `{name}` is {law.feedforward!r}, and must be a member of "
             "`Feedforward`, such as `Feedforward.RELAY`."
         )
-    view, memory = traced_arguments(law, model)
+    memory, x = _memory(law), jnp.zeros(len(model.state_names))
+    begun = checked_trace(
+        LawError, f"`begin` of `{name}`", lambda x: law.begin(model, x), x, advice=_ADVICE
+    )
+    if form_of(memory) != form_of(begun):
+        raise LawError(
+            f"{place_of(type(law))}: the memory of `{name}` is {form_in_words(memory)} by `init` "
+            f"and {form_in_words(begun)} by `begin`, and both must have the same form."
+        )
+    view = _view(law, model)
     output = checked_trace(
         LawError,
         f"`update` of `{name}`",
@@ -105,7 +114,13 @@ def signal_size(law: Law, model: ControlAffine) -> int | None:
     if not Speaks.may(law, "signal"):
         return None
     x = jnp.zeros(len(model.state_names))
-    signal = jax.eval_shape(lambda: Speaks.of(law).signal(model, x, x, _memory(law)))
+    signal = checked_trace(
+        LawError,
+        f"`signal` of `{type(law).__name__}`",
+        lambda x: Speaks.of(law).signal(model, x, x, _memory(law)),
+        x,
+        advice=_ADVICE,
+    )
     return None if signal is None else signal.size
 
 
