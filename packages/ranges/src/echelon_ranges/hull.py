@@ -14,7 +14,7 @@ from typing import NamedTuple, TypeAlias
 import jax
 import numpy as np
 
-from echelon.core.enclosure.atoms import (
+from echelon_ranges.atoms import (
     Atoms,
     Corners,
     CornerValues,
@@ -24,14 +24,12 @@ from echelon.core.enclosure.atoms import (
     constant,
     corner_values,
 )
-from echelon.core.enclosure.interval import Interval
-from echelon.core.enclosure.slopes import Sloped, number, slopes_in, variable
-from echelon.core.errors import GainError
-from echelon.core.jaxpr import evaluate, map_entries
-from echelon.core.rational import float_above
-from echelon.core.types import Array
+from echelon_ranges.errors import RangeError
+from echelon_ranges.interval import Interval, float_above
+from echelon_ranges.jaxpr import evaluate, map_entries
+from echelon_ranges.slopes import Sloped, number, slopes_in, variable
 
-Bounds: TypeAlias = Sequence[float | Fraction] | Array
+Bounds: TypeAlias = Sequence[float | Fraction] | np.ndarray
 _Function: TypeAlias = Callable[[jax.Array, jax.Array], jax.Array]
 
 
@@ -67,8 +65,8 @@ class Hull(NamedTuple):
     entry by entry; it is 0 where floats are exact.
     """
 
-    vertices: Array
-    error: Array
+    vertices: np.ndarray
+    error: np.ndarray
     atoms: tuple[HullAtom, ...]
 
 
@@ -86,8 +84,8 @@ def value_hull(function: _Function, states: Box, inputs: Box, names: Sequence[st
         names: of the entries of x and v, for messages and `atoms`; else x[0], ..., v[0], ...
 
     Raises:
-        OpenError: the function depends on an entry that the box leaves open.
-        GainError: a bound is NaN or above its partner, the function has no enclosure on the box
+        UnboundedError: the function depends on an entry that the box leaves open.
+        RangeError: a bound is NaN or above its partner, the function has no enclosure on the box
             (the primitive is named), or there are more than `MOST_VERTICES` vertices.
     """
     atoms = Atoms()
@@ -116,8 +114,8 @@ def slope_hull(
         weight: (x, v) -> (k, l), whose values are appended to the slopes and enclosed jointly.
 
     Raises:
-        OpenError: the slopes depend on an entry that the box leaves open.
-        GainError: as in `value_hull`; or the function or the weight is discontinuous on the box.
+        UnboundedError: the slopes depend on an entry that the box leaves open.
+        RangeError: as in `value_hull`; or the function or the weight is discontinuous on the box.
     """
     atoms = Atoms()
     x, v = _variables(atoms, states, inputs, names)
@@ -167,7 +165,7 @@ def _variables(
     n, m = _count_bounds(states, "x"), _count_bounds(inputs, "v")
     called = list(names) or [f"x[{k}]" for k in range(n)] + [f"v[{k}]" for k in range(m)]
     if len(called) != n + m:
-        raise GainError(f"`names` has {len(called)} entries, and must have {n + m}.")
+        raise RangeError(f"`names` has {len(called)} entries, and must have {n + m}.")
     bounds = [*zip(*states, strict=True), *zip(*inputs, strict=True)]
     result = np.empty(n + m, object)
     for k, (low, high) in enumerate(bounds):
@@ -185,13 +183,13 @@ def _interval(low: float | Fraction, high: float | Fraction) -> Interval | None:
 def _count_bounds(box: Box, name: str) -> int:
     lower, upper = (list(side) for side in box)
     if len(lower) != len(upper):
-        raise GainError(
+        raise RangeError(
             f"the bounds of `{name}` have {len(lower)} and {len(upper)} entries, "
             "and must be two vectors of the same length."
         )
     for k, (low, high) in enumerate(zip(lower, upper, strict=True)):
         if not low <= high:
-            raise GainError(
+            raise RangeError(
                 f"the bounds of `{name}[{k}]` are {float(low):g} and {float(high):g}, "
                 "and must be in rising order."
             )
@@ -228,7 +226,7 @@ def _round_values(
             # Rounded to the nearest float; the exact difference becomes part of `error`.
             rounded[place] = float(exact)
         except OverflowError as fault:
-            raise GainError("an entry of the hull exceeds float64 on the domain.") from fault
+            raise RangeError("an entry of the hull exceeds float64 on the domain.") from fault
         worst = max(worst, abs(Fraction(float(rounded[place])) - exact))
     return values, rounded, float_above(worst + values.slack)
 

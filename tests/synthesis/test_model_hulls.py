@@ -1,0 +1,66 @@
+"""Hulls of the slopes of bundled models: what they contain, and what a user is told."""
+
+import math
+
+import numpy as np
+import pytest
+from hull_checks import about_zero, assert_supported, points_of, values
+
+from echelon.agents.models import Pendulum, PlanarQuadrotor, Quadrotor, UnicyclePoint, VanDerPol
+from echelon.synthesis.certificates.jacobians import model_jacobian, velocity_of
+from echelon_ranges import Box, RangeError, slope_hull, value_hull
+
+SYSTEMS = {
+    "pendulum": (Pendulum(), Box([-1.2, -2], [0.4, 2]), about_zero(0), 2),
+    "van-der-pol": (VanDerPol(), Box([-1, -2], [3, 1]), about_zero(1), 6),
+    "planar-quadrotor": (
+        PlanarQuadrotor(),
+        Box([0, 0, -0.2, 0, 0, 0], [0, 0, 0.7, 0, 0, 0]),
+        about_zero(3, 1),
+        8,
+    ),
+    "unicycle-point": (
+        UnicyclePoint(),
+        Box([-1, -1, -2.5], [1, 1, 0.3]),
+        about_zero(1, 1),
+        16,
+    ),
+    "body-rates": (
+        Quadrotor.crazyflie(),
+        about_zero(*[0] * 6, 0.5, 0.4, 0.3, 0, 0, 1),
+        about_zero(3, 0, 0, 0),
+        1536,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_the_hull_of_slopes_is_that_of_jacobians_and_holds_them(name):
+    model, states, inputs, vertices = SYSTEMS[name]
+    jacobian = model_jacobian(model)
+    hull, found = (
+        value_hull(jacobian, states, inputs),
+        slope_hull(velocity_of(model), states, inputs),
+    )
+    np.testing.assert_array_equal(found.vertices, hull.vertices)
+    np.testing.assert_array_equal(found.error, hull.error)
+    assert_supported(hull, values(jacobian, states, inputs, points_of(states, inputs, seed=1)))
+    assert len(hull.vertices) == vertices
+
+
+@pytest.mark.parametrize("pitch", [math.pi / 2, 1.6])
+def test_the_edge_of_the_chart_is_named(pitch):
+    model = Quadrotor.crazyflie()
+    box = about_zero(*[0] * 6, 0.1, pitch, 0, 0, 0, 0)
+    with pytest.raises(RangeError) as caught:
+        value_hull(
+            model_jacobian(model),
+            box,
+            about_zero(0, 0, 0, 0),
+            model.state_names + model.input_names,
+        )
+    low = 6.12323e-17 if pitch == math.pi / 2 else -0.0291995
+    assert str(caught.value) == (
+        "the model divides by an expression of `pitch`, which may be anything in "
+        f"[{low:g}, 1] on the domain, and must keep well away from 0; make the domain smaller."
+    )
