@@ -147,7 +147,7 @@ def wheel(rest: list[str]) -> list[list[str]]:
         [echelon, "fly", "paper-radio", "--out", prepared],
         [bare, "-c", NOTHING_ELSE],
         [bare, "-m", FLIGHT, prepared, "--all", *slowly],
-        [str(program("python", of_ranges)), "packages/ranges/examples/pendulum.py"],
+        [str(program("python", of_ranges)), "-c", "import echelon_ranges"],
     ]
 
 

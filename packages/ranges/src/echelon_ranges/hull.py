@@ -1,9 +1,8 @@
 """Polytopes of matrices that provably contain all values or slopes of a function on a box.
 
-The function is traced and evaluated in exact polynomial arithmetic (`rules`, `sloped`, `slopes`).
-Each entry is affine in the coordinates of every atom (a variable's powers, an angle's waves), and
-each atom lies in a polygon with rational vertices (`curve_polygons`): the products of these
-vertices hold every value.
+The function is traced and evaluated in exact polynomial arithmetic (`rules`, `slopes`). Each entry
+is affine in the coordinates of every atom (a variable's powers, an angle's waves), and each atom
+lies in a polygon with rational vertices (`atoms`): the products of these vertices hold every value.
 """
 
 import math
@@ -43,31 +42,15 @@ class Box(NamedTuple):
     upper: Bounds
 
 
-class HullAtom(NamedTuple):
-    """An atom of a hull; the vertices are products of the points of all atoms.
-
-    `name` is the box variable (or the expression), `kind` is `interval`, `powers`, `arc` or
-    `constant`; its range is (lower, upper), angles in rad; `vertices` is its number of
-    points.
-    """
-
-    name: str
-    kind: str
-    lower: float
-    upper: float
-    vertices: int
-
-
 class Hull(NamedTuple):
-    """Every Jacobian is a convex combination of `vertices` plus a matrix within +- `error`.
+    """Every matrix is a convex combination of `vertices` plus a matrix within +- `error`.
 
-    `vertices` (K, n, n) float64 are the exact ones rounded, and `error` (n, n) bounds the rounding
+    `vertices` (K, k, n) float64 are the exact ones rounded, and `error` (k, n) bounds the rounding
     entry by entry; it is 0 where floats are exact.
     """
 
     vertices: np.ndarray
     error: np.ndarray
-    atoms: tuple[HullAtom, ...]
 
 
 def value_hull(function: _Function, states: Box, inputs: Box, names: Sequence[str] = ()) -> Hull:
@@ -81,7 +64,7 @@ def value_hull(function: _Function, states: Box, inputs: Box, names: Sequence[st
         function: (x (n,), v (m,)) -> (k, l), traceable by JAX.
         states: bounds of x, (n,) each.
         inputs: bounds of v, (m,) each.
-        names: of the entries of x and v, for messages and `atoms`; else x[0], ..., v[0], ...
+        names: of the entries of x and v, for messages; else x[0], ..., v[0], ...
 
     Raises:
         UnboundedError: the function depends on an entry that the box leaves open.
@@ -211,7 +194,7 @@ def _hull_of(entries: np.ndarray, atoms: Atoms) -> Hull:
     error = np.array([bound for _, _, bound in parts]).reshape(entries.shape)
     # Different products may give equal matrices, and each vertex is a constraint for a solver.
     vertices = np.unique(np.stack(spread, axis=-1), axis=0)
-    return Hull(vertices.reshape(-1, *entries.shape), error, _describe_atoms(atoms, used, counts))
+    return Hull(vertices.reshape(-1, *entries.shape), error)
 
 
 def _round_values(
@@ -236,16 +219,3 @@ def _expand_values(values: CornerValues, array: np.ndarray, counts: dict[int, in
     shape = [count if atom in values.atoms else 1 for atom, count in counts.items()]
     # An entry is constant along the atoms that it does not use.
     return np.broadcast_to(array.reshape(shape), list(counts.values())).ravel()
-
-
-def _describe_atoms(
-    atoms: Atoms, used: dict[int, set[Exponent]], counts: dict[int, int]
-) -> tuple[HullAtom, ...]:
-    result = []
-    for atom, count in counts.items():
-        source = atoms.known[atom]
-        powers = [e for e in used[atom] if isinstance(e, int)]
-        kind = "arc" if not powers else "interval" if powers == [1] else "powers"
-        low, high = float(source.reach.lo), float(source.reach.hi)
-        result.append(HullAtom(source.name, "constant" if count == 1 else kind, low, high, count))
-    return tuple(result)

@@ -300,8 +300,7 @@ def _constant_columns(function: _OfState, states: Box, inputs: Box) -> Array | N
     """Return (n,) the states in which a function is proved constant; None without an enclosure."""
     constant = np.zeros(len(states.lower), bool)
     try:
-        with precision("float64"):
-            zero = slope_columns(function, states, inputs)
+        zero = slope_columns(function, states, inputs)
     except RangeError:
         return None
     constant[list(zero)] = True
