@@ -117,20 +117,24 @@ def cores() -> int:
 
 
 def wheel(rest: list[str]) -> list[list[str]]:
-    """Build the wheels of echelon and of flight, and return the commands that try them.
+    """Build the wheels of echelon, flight and ranges, and return the commands that try them.
 
     Each is in an empty environment, and they find what an editable install hides: a file that is
     not shipped, a dependency that only an extra or a development tool installs.
     """
-    wheels, alone, vehicle = (BUILD / name for name in ("wheels", "alone", "vehicle"))
-    for folder in (wheels, alone, vehicle):
+    names = ("wheels", "alone", "vehicle", "ranges")
+    wheels, alone, vehicle, of_ranges = folders = [BUILD / name for name in names]
+    for folder in folders:
         clear(folder)
-    install, install_flight = installer(alone), installer(vehicle)
-    for source in (".", "packages/flight"):
+    install, install_flight, install_ranges = map(installer, folders[1:])
+    for source in (".", "packages/flight", "packages/ranges"):
         step(builder(alone, wheels, source), "a wheel could not be built; see the messages above.")
-    [built], [flight] = (wheels.glob(f"{name}-*.whl") for name in ("echelon_formation", FLIGHT))
+    [built], [flight], [ranges] = (
+        wheels.glob(f"{name}-*.whl") for name in ("echelon_formation", FLIGHT, "echelon_ranges")
+    )
     step([*install, str(built), *PINNED], "the wheel could not be installed; see above.")
     step([*install_flight, "--no-index", str(flight)], "the wheel of flight needs an index.")
+    step([*install_ranges, str(ranges), *PINNED], "the wheel of ranges could not be installed.")
     echelon, bare = str(program("echelon", alone)), str(program("python", vehicle))
     prepared, slowly = str(alone / "flight"), ["--seconds", "0.5", "--speed", "0.25"]
     every_name = "import echelon; [getattr(echelon, name) for name in echelon.__all__]"
@@ -143,6 +147,7 @@ def wheel(rest: list[str]) -> list[list[str]]:
         [echelon, "fly", "paper-radio", "--out", prepared],
         [bare, "-c", NOTHING_ELSE],
         [bare, "-m", FLIGHT, prepared, "--all", *slowly],
+        [str(program("python", of_ranges)), "-c", "import echelon_ranges"],
     ]
 
 

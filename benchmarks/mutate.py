@@ -31,9 +31,16 @@ from typing import NamedTuple
 ROOT = Path(__file__).resolve().parents[1]
 # The tests of a package, or of a file that has tests of its own.
 TESTS = {
-    "core": ["jaxpr", "linearization", "lyapunov", "bad_input", "limits", "gains", "doctor"],
-    "core/enclosure": ["interval", "hull", "jaxpr", "exact", "regional"],
-    "core/enclosure/interval.py": ["interval", "hull"],
+    "core": ["linearization", "lyapunov", "bad_input", "limits", "gains", "doctor"],
+    "packages/ranges/src/echelon_ranges": [
+        "interval",
+        "hull",
+        "taylor",
+        "jaxpr",
+        "exact",
+        "regional",
+    ],
+    "packages/ranges/src/echelon_ranges/interval.py": ["interval", "hull"],
     "agents/network": ["graph", "formation", "limits"],
     "synthesis/certificates": ["exact", "regional", "lmi", "lyapunov", "margins", "gains"],
     "synthesis/certificates/exact_proofs.py": ["exact"],
@@ -272,13 +279,14 @@ def listed_for(package: str, file: str, paths: dict[str, str]) -> list[str]:
 
 def study(tree: Path, package: str, only: str, count: int, seed: int) -> tuple[int, list[Change]]:
     """Try changes of a package; return how many were killed, and those that survived."""
-    files = sorted((tree / "src" / "echelon" / package).glob(only or "*.py"))
+    home = tree if package.startswith("packages/") else tree / "src" / "echelon"
+    files = sorted((home / package).glob(only or "*.py"))
     every = [change for file in files for change in changes(file)]
     drawn = random.Random(seed).sample(every, min(count, len(every)))
-    paths = {path.stem: str(path.relative_to(tree)) for path in (tree / "tests").rglob("test_*.py")}
+    paths = {path.stem: str(path.relative_to(tree)) for path in tree.glob("**/test_*.py")}
     tests_of = {file: listed_for(package, file.name, paths) for file in files}
     tests = sorted({test for change in drawn for test in tests_of[change.file]})
-    watch, recorded, begun = Watch(str(tree / "src" / "echelon")), tree / "calls", time.monotonic()
+    watch, recorded, begun = Watch(str(home)), tree / "calls", time.monotonic()
     if forked(tests, 3600.0, watch, recorded):
         raise SystemExit(f"the tests of `{package}` fail without any change: {' '.join(tests)}")
     watch.calls, watch.of_module, watch.seconds = pickle.loads(recorded.read_bytes())
@@ -330,7 +338,7 @@ def main() -> None:
         )
         os.chdir(tree)
         # A test's own processes look here too; with `CI`, hypothesis draws the same every time.
-        sources = [str(tree / "src"), str(tree / "packages" / "flight" / "src")]
+        sources = [str(tree / "src"), *map(str, (tree / "packages").glob("*/src"))]
         os.environ |= {"PYTHONPATH": os.pathsep.join(sources), "CI": "1"}
         os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         os.environ["JAX_COMPILATION_CACHE_DIR"] = str(tree / "compiled")

@@ -154,7 +154,7 @@ def main() -> int:
         for place, source in zip(places, (given.before, given.after), strict=True):
             place.mkdir()
             call = [sys.executable, __file__, str(source), "--write", str(place), "--only"]
-            paths = [source.resolve(), source.resolve().parent / "packages/flight/src"]
+            paths = [source.resolve(), *source.resolve().parent.glob("packages/*/src")]
             env = {"PYTHONPATH": ":".join(map(str, paths)), "ECHELON_CACHE": "off", "PATH": ""}
             subprocess.run([*call, *given.only], env=env, check=True)
         for name in given.only:

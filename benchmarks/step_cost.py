@@ -71,8 +71,8 @@ def main() -> None:
     args = parser.parse_args()
     both = []
     for source in (args.before, args.after):
-        flight = Path(source).resolve().parent / "packages" / "flight" / "src"
-        home = {**os.environ, "PYTHONPATH": f"{Path(source).resolve()}{os.pathsep}{flight}"}
+        paths = [Path(source).resolve(), *Path(source).resolve().parent.glob("packages/*/src")]
+        home = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, paths))}
         command = [sys.executable, __file__, "--worker"]
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
         both.append(subprocess.Popen(command, env=home, **pipes))

@@ -22,7 +22,7 @@ from echelon.experiments.scenario.named_class import resolve
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "src" / "echelon"
-FLIGHT = ROOT / "packages" / "flight" / "src" / "echelon_flight"
+LIBRARIES = {path.name: path for path in (ROOT / "packages").glob("*/src/echelon_*")}
 
 HEAVY = ["jax", "equinox", "scipy", "networkx", "cvxpy", "casadi", "matplotlib", "xarray"]
 
@@ -34,16 +34,20 @@ def module_of(path: Path) -> str:
 
     Those of other packages are absolute: `echelon_flight.wire`.
     """
-    base = PACKAGE if path.is_relative_to(PACKAGE) else FLIGHT.parent
+    homes = [PACKAGE, *(library.parent for library in LIBRARIES.values())]
+    [base] = [home for home in homes if path.is_relative_to(home)]
     parts = path.relative_to(base).with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-PATHS = {module_of(path): path for path in [*FILES, *FLIGHT.rglob("*.py")]}
+INNER = [path for library in LIBRARIES.values() for path in library.rglob("*.py")]
+PATHS = {module_of(path): path for path in [*FILES, *INNER]}
 
 
-def is_flight(module: str) -> bool:
-    return module.split(".")[0] == FLIGHT.name
+def package_of(module: str) -> str:
+    """The package that holds a module: `echelon`, or a library of its own."""
+    first = module.split(".")[0]
+    return first if first in LIBRARIES else "echelon"
 
 
 @cache
@@ -87,7 +91,7 @@ def targets(module: str, node: ast.Import | ast.ImportFrom) -> list[str]:
 
 def inside(name: str) -> str | None:
     """The module of `PATHS` that an absolute name is or belongs to, if any."""
-    if is_flight(name):
+    if name.split(".")[0] in LIBRARIES:
         return name if name in PATHS else inside(name.rpartition(".")[0])
     if name.split(".")[0] != "echelon":
         return None
@@ -134,12 +138,12 @@ def functions() -> list[tuple[str, int]]:
     return found
 
 
-def imported(of_flight: bool = False) -> set[tuple[str, str]]:
-    """Each module of echelon, or of flight, with each absolute name that it may load."""
+def imported(package: str = "echelon") -> set[tuple[str, str]]:
+    """Each module of echelon, or of another package, with each absolute name that it may load."""
     return {
         (module, name)
         for module in PATHS
-        if is_flight(module) is of_flight
+        if package_of(module) == package
         for node in statements(tree(module))
         for name in targets(module, node)
     }
@@ -147,10 +151,10 @@ def imported(of_flight: bool = False) -> set[tuple[str, str]]:
 
 @cache
 def classes() -> list[type]:
-    names = [module if is_flight(module) else f"echelon.{module}".rstrip(".") for module in PATHS]
+    names = [m if package_of(m) == m.split(".")[0] else f"echelon.{m}".rstrip(".") for m in PATHS]
     members = [vars(importlib.import_module(name)) for name in names]
     found = [value for values in members for value in values.values() if inspect.isclass(value)]
-    own = ("echelon", FLIGHT.name)
+    own = ("echelon", *LIBRARIES)
     return list({cls: None for cls in found if cls.__module__.split(".")[0] in own})
 
 
@@ -204,15 +208,17 @@ def test_no_import_goes_up_not_even_for_annotations():
 
 def test_flight_needs_the_standard_library_alone():
     """Import contracts name libraries; here all others count too, but for those of links."""
-    pairs = {(m.rpartition(".")[2], name.split(".")[0]) for m, name in imported(of_flight=True)}
-    own = {FLIGHT.name, *sys.stdlib_module_names}
+    flight = imported("echelon_flight")
+    pairs = {(m.rpartition(".")[2], name.split(".")[0]) for m, name in flight}
+    own = {"echelon_flight", *sys.stdlib_module_names}
     found = {each for each in pairs if each[1] not in own}
     assert found == {("crazyflie", "cflib"), ("px4", "pymavlink")}
 
 
 def test_echelon_knows_five_names_of_flight_and_its_version():
-    flight = importlib.import_module(FLIGHT.name)
-    found = {name.removeprefix(f"{FLIGHT.name}.") for _, name in imported() if is_flight(name)}
+    flight = importlib.import_module("echelon_flight")
+    names = {name for _, name in imported() if package_of(name) == flight.__name__}
+    found = {name.removeprefix(f"{flight.__name__}.") for name in names}
     assert found == {
         *("FlightError", "__version__"),
         *("mission.check_options", "page_server.Handler", "wire.LeaderPacket"),
@@ -220,16 +226,32 @@ def test_echelon_knows_five_names_of_flight_and_its_version():
     assert flight.__version__ == CONTAINED
 
 
+def test_ranges_need_jax_and_numpy_alone_and_echelon_uses_their_border():
+    ranges = importlib.import_module("echelon_ranges")
+    needed = {name.split(".")[0] for _, name in imported(ranges.__name__)}
+    assert needed - {ranges.__name__, *sys.stdlib_module_names} == {"jax", "numpy"}
+    names = {name for _, name in imported() if package_of(name) == ranges.__name__}
+    border = {f"{ranges.__name__}.{name}" for name in ranges.__all__}
+    assert border == {name for name in names if not name.startswith(f"{ranges.__name__}.jaxpr.")}
+    assert len(border) <= 13 and len(names - border) <= 13
+
+
 def test_folders_are_layers_and_packages_and_the_top_holds_the_entry_points_alone():
     assert max(len(path.relative_to(PACKAGE).parts) for path in FILES) <= 3
-    assert max(len(path.relative_to(FLIGHT).parts) for path in FLIGHT.rglob("*.py")) <= 2
+    depths = [
+        len(path.relative_to(home).parts)
+        for home in LIBRARIES.values()
+        for path in INNER
+        if path.is_relative_to(home)
+    ]
+    assert max(depths) <= 2
     files = {path.name for path in PACKAGE.iterdir() if path.is_file()}
     assert files == {"__init__.py", "__init__.pyi", "__main__.py", "py.typed"}
 
 
 def test_the_names_of_files_and_classes_are_unique():
     names = Counter(
-        (is_flight(module), name)
+        (package_of(module), name)
         for module in PATHS
         for name in [
             PATHS[module].stem,
@@ -350,7 +372,7 @@ def test_every_dependency_is_pinned_imported_or_has_its_reason():
     assert "://" not in text and "\n-" not in text
     optional = ("certify", "cluster", "crazyflie", "fast", "optimal", "parquet", "px4", "video")
     names = [*project()["dependencies"], *itertools.chain(*(extras[name] for name in optional))]
-    used = {name.split(".")[0] for _, name in imported() | imported(of_flight=True)}
+    used = {name.split(".")[0] for _, name in imported() | imported("echelon_flight")}
     # What pandas writes Parquet with.
     required = {re.match(r"[\w-]+", name)[0].replace("-", "_") for name in names}
     assert required - used == {"pyarrow"}
@@ -392,9 +414,10 @@ def plain(requirement: str) -> str:
 def test_the_table_of_mutate_names_packages_and_tests_that_exist():
     code = ast.parse((ROOT / "benchmarks" / "mutate.py").read_text("utf-8"))
     named = {node.targets[0].id: node.value for node in code.body if isinstance(node, ast.Assign)}
-    tests = {path.stem.removeprefix("test_") for path in (ROOT / "tests").rglob("test_*.py")}
+    found = [path for name in ("tests", "packages") for path in (ROOT / name).rglob("test_*.py")]
+    tests = {path.stem.removeprefix("test_") for path in found}
     for place, names in ast.literal_eval(named["TESTS"]).items():
-        assert (PACKAGE / place).exists(), place
+        assert (PACKAGE / place).exists() or (ROOT / place).exists(), place
         assert set(names) <= tests, place
 
 

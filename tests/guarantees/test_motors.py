@@ -15,7 +15,6 @@ from in_words import in_words
 
 import echelon as ech
 from echelon.core.digits import at_most
-from echelon.core.enclosure.taylor import enclose_derivatives
 from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis
 from echelon.core.words import Kind, Verdict
@@ -27,36 +26,6 @@ from echelon.simulation.engine.prepare import prepare
 
 QUADROTOR = ech.models.Quadrotor()
 MIXER = np.asarray(QUADROTOR.input_limits.matrix)
-
-
-def hard(t):
-    """All functions that a path may be made of, where each is defined."""
-    u, v = 0.3 * jnp.sin(t) + 0.5, jnp.sqrt(1.5 + jnp.cos(2.0 * t))
-    return jnp.stack(
-        [
-            jnp.exp(u) * v**3 + jnp.log(v) / jnp.cosh(u) + jnp.sinh(u) * jnp.expm1(v),
-            jnp.arctan(u * v) + jnp.arcsin(u) - jnp.arccos(u) * jnp.tanh(v),
-            jnp.tan(u) ** 2 + u**1.5 + jax.nn.sigmoid(t) - jnp.log1p(v) + 1.0 / v**2,
-        ]
-    )
-
-
-@pytest.mark.parametrize("path", [ech.references.Lemniscate(), hard], ids=["lemniscate", "hard"])
-def test_a_path_and_its_derivatives_lie_in_their_enclosure(path):
-    times = [Fraction(k, 100) for k in range(4)]
-    with precision("float64"):
-        rows = [path]
-        for _ in range(4):
-            rows.append(jax.jacfwd(rows[-1]))
-        every = jax.jit(jax.vmap(lambda t: jnp.stack([row(t) for row in rows])))
-        for piece, low, high in zip(enclose_derivatives(path, times, 4), times, times[1:]):
-            seen = np.asarray(every(jnp.linspace(float(low), float(high), 30)))
-            lows = np.array([[float(x.lo) for x in row] for row in piece])
-            highs = np.array([[float(x.hi) for x in row] for row in piece])
-            size = 1.0 + np.abs(seen).max(axis=0)
-            assert (seen >= lows - 1e-11 * size).all() and (seen <= highs + 1e-11 * size).all()
-            # Near, too: farther off by less than half of the values themselves.
-            assert (highs - lows <= np.ptp(seen, axis=0) + 0.5 * size).all()
 
 
 @pytest.mark.parametrize("roots", [(2.0, 2.5, 3.0), (4.0, 4.5, 5.0)])

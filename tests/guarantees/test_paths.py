@@ -10,12 +10,11 @@ from in_words import in_words
 
 import echelon as ech
 from echelon.agents.models.chains import chains_of
-from echelon.core.enclosure.taylor import enclose_derivatives
-from echelon.core.errors import GainError
 from echelon.core.numerics import precision
 from echelon.guarantees.promises.promise import guarantee
 from echelon.guarantees.stopping.path_bounds import path_fault, pieces_of
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
+from echelon_ranges import enclose_derivatives
 
 MODEL = ech.models.DoubleIntegrator(2)
 
@@ -185,10 +184,3 @@ def test_behind_a_rough_path_nothing_is_guaranteed(name):
     assert found.promised == (name == "sine")
     if not found.promised:
         assert "`Along` is not known to have 2 bounded derivatives" in in_words(found)
-
-
-def test_a_branch_is_left_between_two_intervals_by_neither():
-    # At 1 s both intervals touch the edge, which belongs to one side alone.
-    for bent in (lambda t: jnp.abs(t - 1.0), lambda t: jnp.maximum(t, 1.0), ROUGH["floor"]):
-        with pytest.raises(GainError, match="passes from one branch of it to another"):
-            list(enclose_derivatives(lambda t: bent(t)[None], [Fraction(k) for k in range(3)], 1))

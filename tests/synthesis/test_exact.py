@@ -7,14 +7,14 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from hull_checks import NO_INPUTS, euler_rate_quadrotor, quadrotor_box
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from quadrotor_hulls import NO_INPUTS, euler_rate_quadrotor, quadrotor_box
 
-from echelon.core.enclosure.hull import value_hull
 from echelon.core.errors import GainError
 from echelon.synthesis.certificates.exact_proofs import prove_contraction
+from echelon_ranges import value_hull
 
 
 def negative_definite(M):

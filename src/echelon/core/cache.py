@@ -10,6 +10,7 @@ pickles that are read from it are run.
 import contextlib
 import functools
 import hashlib
+import importlib.util
 import io
 import os
 import pickle
@@ -398,18 +399,25 @@ def loaded_sources() -> bytes | None:
 
 
 def sources() -> bytes | None:
-    """Return a digest of echelon's source files; None if the loaded code may differ from them."""
-    home, hasher = Path(__file__).parents[1], hashlib.sha256()
+    """Return a digest of the source files; None if the loaded code may differ from them."""
+    # Found and not imported, since the command line opens the cache before it needs JAX.
+    ranges = importlib.util.find_spec("echelon_ranges")
+    homes, hasher = [Path(__file__).parents[1]], hashlib.sha256()
+    homes += [Path(place) for place in (ranges and ranges.submodule_search_locations) or ()]
     try:
-        files = [(file, file.stat(), file.read_bytes()) for file in sorted(home.rglob("*.py"))]
+        files = [
+            (file.relative_to(home.parent), file.stat(), file.read_bytes())
+            for home in homes
+            for file in sorted(home.rglob("*.py"))
+        ]
     except OSError:
         return None
     # A file copied with an old date counts by its change time.
     late = any(max(status.st_mtime, status.st_ctime) >= BEGAN for _, status, _ in files)
-    if late or Path(__file__) not in (file for file, *_ in files):
+    if late or Path(*Path(__file__).parts[-3:]) not in (file for file, *_ in files):
         return None
     for file, _, content in files:
-        hasher.update(f"{file.relative_to(home)}\0{len(content)}\0".encode() + content)
+        hasher.update(f"{file}\0{len(content)}\0".encode() + content)
     return hasher.digest()
 
 

@@ -20,7 +20,10 @@ from typing import Any, Final, TypeAlias, final
 
 _LARGE: Final = 4096
 """Arrays of at least this many bytes are hashed in place and not copied."""
-_TRUSTED: Final = {"echelon", "builtins", "numpy", "jax", "jaxlib", "equinox", "scipy"}
+_TRUSTED: Final = {
+    *("echelon", "echelon_ranges"),
+    *("builtins", "numpy", "jax", "jaxlib", "equinox", "scipy"),
+}
 _PLAIN: Final = (bool, int, float, complex, str, bytes, Fraction, type(None))
 _SPECIAL: Final = {
     *("__dict__", "__weakref__", "__doc__", "__module__", "__annotations__", "__slots__")

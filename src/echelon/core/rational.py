@@ -8,7 +8,8 @@ from collections.abc import Callable
 from fractions import Fraction
 from typing import TypeVar
 
-_ROOT_BITS = 96  # significant bits of a root that is irrational
+from echelon_ranges import ELEMENTARY, point
+
 _FINE = 1 << 64
 _ZERO = Fraction(0)
 
@@ -17,14 +18,12 @@ _Real = TypeVar("_Real", float, Fraction)
 
 def float_below(x: Fraction) -> float:
     """Return the largest float that is not above x."""
-    near = float(x)
-    # `float` rounds to nearest, and a lower bound must not be rounded up.
-    return near if Fraction(near) <= x else math.nextafter(near, -math.inf)
+    return point(x).floats()[0]
 
 
 def float_above(x: Fraction) -> float:
     """Return the smallest float that is not below x."""
-    return -float_below(-x)
+    return point(x).floats()[1]
 
 
 def round_up(x: Fraction) -> Fraction:
@@ -34,14 +33,8 @@ def round_up(x: Fraction) -> Fraction:
 
 def root_bounds(x: Fraction | int) -> tuple[Fraction, Fraction]:
     """Return short rationals below and above the root of x >= 0; both are equal if it is short."""
-    x = Fraction(x)
-    bits = x.denominator.bit_length() // 2 - x.numerator.bit_length() // 2
-    shift = max(0, _ROOT_BITS + bits)
-    square = x * (1 << (2 * shift))
-    # isqrt(floor(s)) <= sqrt(s) < isqrt(floor(s)) + 1.
-    low = math.isqrt(math.floor(square))
-    high = low if low * low == square else low + 1
-    return Fraction(low, 1 << shift), Fraction(high, 1 << shift)
+    root = ELEMENTARY["sqrt"].range(point(x))
+    return root.lo, root.hi
 
 
 def norm_above(first: Fraction, *others: Fraction) -> Fraction:

@@ -13,12 +13,12 @@ from echelon.agents.references.flatness import reference_warnings
 from echelon.agents.references.reference import LeaderPath, Reference
 from echelon.core.cache import memoize
 from echelon.core.errors import LawError
-from echelon.core.jaxpr import used_leaves
 from echelon.core.numerics import precision
 from echelon.core.trace import check_array, checked_trace, form_in_words, form_of, place_of
 from echelon.core.types import PyTree
 from echelon.core.words import Feedforward, amount
 from echelon.laws.law import Feeds, Law, LocalView, Memory, Speaks, reference_of
+from echelon_ranges.jaxpr import used_leaves
 
 _ADVICE = "it must be written with `jax.numpy` and take what one agent knows"
 

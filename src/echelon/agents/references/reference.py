@@ -12,11 +12,11 @@ import numpy as np
 from echelon.agents.models.heading_symmetry import heading_index, heading_of, rest_heading
 from echelon.agents.models.model import ControlAffine
 from echelon.core.cache import memoize
-from echelon.core.enclosure.hull import Box, value_hull
-from echelon.core.errors import GainError, LawError, ReferenceError, check_kind, listing
+from echelon.core.errors import LawError, ReferenceError, check_kind, listing
 from echelon.core.numerics import derivatives, precision
 from echelon.core.trace import call_once_traced, check_array, checked_trace
 from echelon.core.types import Array, Declared, Input, Scalar, State
+from echelon_ranges import Box, RangeError, value_hull
 
 
 class LeaderPath(Declared):
@@ -144,7 +144,7 @@ def _turns(reference: Reference, index: int, rest: float) -> bool:
     try:
         with precision("float64"):
             hull = value_hull(coordinate, Box([0], [_MAX_TIME]), Box([0], [0]))
-    except GainError:
+    except RangeError:
         return True
     return bool((hull.vertices != rest).any() or hull.error.any())
 

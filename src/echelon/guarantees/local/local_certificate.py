@@ -18,7 +18,6 @@ import scipy.sparse.linalg as spla
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
-from echelon.core.jaxpr import used_leaves
 from echelon.core.types import Array, PyTree
 from echelon.core.words import Feedforward
 from echelon.guarantees.local.resting_loop import (
@@ -45,6 +44,7 @@ from echelon.simulation.step.own_members import own_members
 from echelon.simulation.step.records import LoopState
 from echelon.simulation.step.sequence import begin, step
 from echelon.simulation.step.turns import by_depth
+from echelon_ranges.jaxpr import used_leaves
 
 _DENSE = 1500
 """Numbers of a formation up to which one map of all of them is made."""

@@ -18,7 +18,6 @@ from echelon.agents.network.channel import Channel, Network
 from echelon.agents.network.graph import Graph
 from echelon.core.claim import Number, Rounding
 from echelon.core.digits import about, at_least, at_most
-from echelon.core.enclosure.interval import ELEMENTARY, point
 from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis, Statement, fails, holds
 from echelon.core.types import Array, JsonObject
@@ -27,6 +26,7 @@ from echelon.laws.law import Travels
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.networks import HOP_LIFE
 from echelon.simulation.step.settings import Settings
+from echelon_ranges import ELEMENTARY, point
 
 # ---- ages of messages ----------------------------------------------------------------------------
 # A message that arrives is never replaced by an older one. So if a link loses at most L messages in

@@ -7,9 +7,9 @@ from fractions import Fraction
 from typing import NamedTuple, final
 
 from echelon.core.digits import about
-from echelon.core.enclosure.interval import ELEMENTARY, point
 from echelon.core.errors import GainError
 from echelon.core.rational import round_up
+from echelon_ranges import ELEMENTARY, point
 
 _FINE = Fraction(1, 2**40)
 """Of the unit interval; what is not told apart on so short a piece is bounded by its size."""

@@ -14,7 +14,6 @@ from echelon.agents.models.chains import flat_output
 from echelon.agents.models.declarations import is_by_user
 from echelon.agents.models.model import ControlAffine
 from echelon.core.digits import about
-from echelon.core.jaxpr import used_leaves
 from echelon.core.numerics import precision
 from echelon.core.rational import float_above
 from echelon.core.statement import Hypothesis, Statement, holds
@@ -24,6 +23,7 @@ from echelon.guarantees.promises.leaders import own_run
 from echelon.guarantees.stopping.chain_response import slices_of
 from echelon.guarantees.stopping.path_bounds import Pieces, pieces_of
 from echelon.guarantees.stopping.stopping_run import StoppingRun
+from echelon_ranges.jaxpr import used_leaves
 
 _ROUNDED = Fraction(1, 10**6)
 """Of a start in flat coordinates: a thousand times what floats leave of it."""

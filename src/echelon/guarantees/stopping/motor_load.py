@@ -13,7 +13,6 @@ from echelon.agents.models.model import Airframe, ControlAffine, in_metres
 from echelon.core.cache import memoize
 from echelon.core.claim import Number, Rounding
 from echelon.core.digits import at_least, at_most
-from echelon.core.enclosure.interval import ELEMENTARY, point
 from echelon.core.rational import (
     bisect,
     float_above,
@@ -39,6 +38,7 @@ from echelon.guarantees.stopping.linear_load import linear_limits
 from echelon.guarantees.stopping.path_bounds import Pieces, pieces_of
 from echelon.guarantees.stopping.stopping_run import StoppingRun
 from echelon.laws.stopping_point import StoppingLeader
+from echelon_ranges import ELEMENTARY, point
 
 # ---- bounds on the thrust of four motors ---------------------------------------------------------
 # With F = p'' + g e3 the thrust is m |F| along F, and the derivatives of F turn it: R'F' and R'F''

@@ -1,7 +1,8 @@
 """Bounds on the derivatives of a leader's path, and whether it has those that T5 asks of it."""
 
+import contextlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
 from typing import NamedTuple, TypeAlias
 
@@ -14,12 +15,11 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.references.reference import COORDINATES, LeaderPath, Reference
 from echelon.core.cache import memoize
 from echelon.core.digits import about
-from echelon.core.enclosure.interval import Interval, point
-from echelon.core.enclosure.taylor import enclose_derivatives, enclose_finely
 from echelon.core.errors import GainError
 from echelon.core.numerics import derivatives, precision
 from echelon.core.rational import float_below, root_bounds
 from echelon.laws.stopping_point import StoppingLeader
+from echelon_ranges import Interval, RangeError, enclose_derivatives, enclose_finely, point
 
 _PIECE, _MOST = Fraction(1, 20), 800
 """Of time, s, and about how many there are."""
@@ -49,6 +49,15 @@ class Pieces(NamedTuple):
         spans = zip(self.times, self.times[1:], self.values, strict=False)
         rows = [v for a, b, v in spans if b >= begin and (end is None or a <= end)]
         return rows or self.values[-1:]
+
+
+@contextlib.contextmanager
+def as_gain_error() -> Iterator[None]:
+    """Raise the error of a path that has no enclosure as a `GainError`, in the same words."""
+    try:
+        yield
+    except RangeError as error:
+        raise GainError(str(error)) from error
 
 
 def pieces_of(
@@ -82,7 +91,8 @@ def _pieces(reference: LeaderPath, horizon: float, outputs: tuple[str, ...], ord
         # What does not move is known in one piece, and so is what has a constant derivative.
         for cut in (1, count):
             ends = [times[-1] + span * k / cut for k in range(cut + 1)]
-            rows = list(enclose_finely(lambda t, path=path: path(t)[picked], ends, order))
+            with as_gain_error():
+                rows = list(enclose_finely(lambda t, path=path: path(t)[picked], ends, order))
             if all(x.hi - x.lo < _EXACT for piece in rows for x in piece.rows[-1]):
                 break
         times += [piece.end for piece in rows]
@@ -151,7 +161,8 @@ def _check(reference: Reference, outputs: tuple[str, ...], order: int, horizon: 
         def path(t: jax.Array, part: Callable[[jax.Array], jax.Array] = part) -> jax.Array:
             return part(t)[picked]
 
-        list(enclose_finely(path, (Fraction(begin), Fraction(until)), 0))
+        with as_gain_error():
+            list(enclose_finely(path, (Fraction(begin), Fraction(until)), 0))
         compare_derivatives(path, order, begin, until)
         begin = until
 
@@ -185,7 +196,8 @@ def compare_derivatives(
             return
         for t in np.linspace(begin, end, _TIMES):
             values = np.asarray(derivatives(path, jnp.asarray(t), order)).ravel().tolist()
-            [rows] = enclose_derivatives(path, (Fraction(t), Fraction(t)), order)
+            with as_gain_error():
+                [rows] = enclose_derivatives(path, (Fraction(t), Fraction(t)), order)
             for x, value in zip(sum(rows, []), values, strict=True):
                 slack = Fraction(_SAME) * (1 + max(abs(x.lo), abs(x.hi)))
                 if not (np.isfinite(value) and x.lo - slack <= Fraction(value) <= x.hi + slack):

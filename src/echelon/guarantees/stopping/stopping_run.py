@@ -20,7 +20,6 @@ from echelon.agents.network.matrices import unreached
 from echelon.core.cache import memoize
 from echelon.core.compiled import cached_jit
 from echelon.core.digits import about, at_least, at_most
-from echelon.core.enclosure.interval import point
 from echelon.core.errors import GraphError
 from echelon.core.linear import sampled_radius
 from echelon.core.rational import float_above
@@ -42,6 +41,7 @@ from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.scalars import Node, ScalarGraph, Unsupported, lower, nodes
 from echelon.simulation.step.settings import Settings
+from echelon_ranges import point
 
 # ---- states that are flat outputs ----------------------------------------------------------------
 

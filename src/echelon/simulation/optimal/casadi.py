@@ -15,7 +15,7 @@ import numpy as np
 from jax.extend.core import JaxprEqn
 
 from echelon.core.errors import MissingExtraError, ModelError
-from echelon.core.jaxpr import Algebra, Rule, dot, entrywise, evaluate, map_entries, reduction
+from echelon_ranges.jaxpr import Algebra, Rule, dot, entrywise, evaluate, map_entries, reduction
 
 if TYPE_CHECKING:  # it comes with an extra
     from casadi import SX, Function

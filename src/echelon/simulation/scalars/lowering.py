@@ -16,17 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from echelon.core.jaxpr import (
-    Algebra,
-    Rule,
-    apply,
-    dot,
-    entrywise,
-    has_function,
-    map_entries,
-    reduction,
-    walk,
-)
 from echelon.core.numerics import Precision, precision
 from echelon.core.trace import error_summary
 from echelon.core.types import PyTree
@@ -51,6 +40,17 @@ from echelon.simulation.scalars.traced_entries import (
     where,
 )
 from echelon.simulation.scalars.whole_numbers import WHOLE_NUMBERS, TypeRules
+from echelon_ranges.jaxpr import (
+    Algebra,
+    Rule,
+    apply,
+    dot,
+    entrywise,
+    has_function,
+    map_entries,
+    reduction,
+    walk,
+)
 
 
 def lower(

@@ -8,8 +8,8 @@ from jax.core import ShapedArray
 from jax.extend.core import JaxprEqn, Literal, Var
 
 from echelon.core.errors import EchelonError
-from echelon.core.jaxpr import Algebra
 from echelon.simulation.scalars.scalar_graph import Entry, Node, ScalarGraph
+from echelon_ranges.jaxpr import Algebra
 
 LONGEST = 64
 """The most rounds of a loop that are unrolled, and places of a table that are searched."""

@@ -11,7 +11,6 @@ from collections.abc import Callable
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from echelon.core.jaxpr import INLINED, Algebra, map_entries
 from echelon.simulation.scalars.elementary import choose, less, remainder, signed
 from echelon.simulation.scalars.scalar_graph import LOGICAL, Entry, Node, ScalarGraph, needed
 from echelon.simulation.scalars.traced_entries import (
@@ -26,6 +25,7 @@ from echelon.simulation.scalars.traced_entries import (
     select,
     where,
 )
+from echelon_ranges.jaxpr import INLINED, Algebra, map_entries
 
 _EXACT = {64: 2.0**53, 32: 2.0**24}
 _CALLS = INLINED | {"scan", "while", "cond"}

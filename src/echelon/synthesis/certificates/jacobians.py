@@ -11,14 +11,20 @@ import numpy as np
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.secants import find_gap, find_jump
 from echelon.core.cache import memoize
-from echelon.core.enclosure.atoms import OpenError
-from echelon.core.enclosure.hull import Box, Hull, slope_columns, slope_hull
-from echelon.core.enclosure.slopes import JumpError
 from echelon.core.errors import GainError
 from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.core.words import Kind
 from echelon.synthesis.certificates.domain import Domain
+from echelon_ranges import (
+    Box,
+    Hull,
+    JumpError,
+    RangeError,
+    UnboundedError,
+    slope_columns,
+    slope_hull,
+)
 
 # ---- samples -------------------------------------------------------------------------------------
 
@@ -231,12 +237,12 @@ def _enclose(
     with precision("float64"):
         try:
             hull = slope_hull(velocity, *_boxes(model, domain), names, weight)
-        except OpenError as error:
+        except UnboundedError as error:
             raise unbounded_error(model, error.name) from error
-        except JumpError:
+        except JumpError as error:
             # Samples would hardly meet the jump, and JAX's derivative there is 0.
-            raise
-        except GainError as error:
+            raise GainError(str(error)) from error
+        except RangeError as error:
             samples, why = sample_jacobians(model, domain, velocity, weight), str(error).rstrip(".")
             return _freeze(Jacobians(samples, np.zeros(samples.shape[1:]), Kind.SAMPLES, why))
         check_secants(model, domain, velocity, hull)
@@ -294,9 +300,8 @@ def _constant_columns(function: _OfState, states: Box, inputs: Box) -> Array | N
     """Return (n,) the states in which a function is proved constant; None without an enclosure."""
     constant = np.zeros(len(states.lower), bool)
     try:
-        with precision("float64"):
-            zero = slope_columns(function, states, inputs)
-    except GainError:
+        zero = slope_columns(function, states, inputs)
+    except RangeError:
         return None
     constant[list(zero)] = True
     return constant

@@ -1,9 +1,8 @@
 """Polytopes of matrices that provably contain all values or slopes of a function on a box.
 
-The function is traced and evaluated in exact polynomial arithmetic (`rules`, `sloped`, `slopes`).
-Each entry is affine in the coordinates of every atom (a variable's powers, an angle's waves), and
-each atom lies in a polygon with rational vertices (`curve_polygons`): the products of these
-vertices hold every value.
+The function is traced and evaluated in exact polynomial arithmetic (`rules`, `slopes`). Each entry
+is affine in the coordinates of every atom (a variable's powers, an angle's waves), and each atom
+lies in a polygon with rational vertices (`atoms`): the products of these vertices hold every value.
 """
 
 import math
@@ -14,7 +13,7 @@ from typing import NamedTuple, TypeAlias
 import jax
 import numpy as np
 
-from echelon.core.enclosure.atoms import (
+from echelon_ranges.atoms import (
     Atoms,
     Corners,
     CornerValues,
@@ -24,14 +23,12 @@ from echelon.core.enclosure.atoms import (
     constant,
     corner_values,
 )
-from echelon.core.enclosure.interval import Interval
-from echelon.core.enclosure.slopes import Sloped, number, slopes_in, variable
-from echelon.core.errors import GainError
-from echelon.core.jaxpr import evaluate, map_entries
-from echelon.core.rational import float_above
-from echelon.core.types import Array
+from echelon_ranges.errors import RangeError
+from echelon_ranges.interval import Interval, float_above
+from echelon_ranges.jaxpr import evaluate, map_entries
+from echelon_ranges.slopes import Sloped, number, slopes_in, variable
 
-Bounds: TypeAlias = Sequence[float | Fraction] | Array
+Bounds: TypeAlias = Sequence[float | Fraction] | np.ndarray
 _Function: TypeAlias = Callable[[jax.Array, jax.Array], jax.Array]
 
 
@@ -45,31 +42,15 @@ class Box(NamedTuple):
     upper: Bounds
 
 
-class HullAtom(NamedTuple):
-    """An atom of a hull; the vertices are products of the points of all atoms.
-
-    `name` is the box variable (or the expression), `kind` is `interval`, `powers`, `arc` or
-    `constant`; its range is (lower, upper), angles in rad; `vertices` is its number of
-    points.
-    """
-
-    name: str
-    kind: str
-    lower: float
-    upper: float
-    vertices: int
-
-
 class Hull(NamedTuple):
-    """Every Jacobian is a convex combination of `vertices` plus a matrix within +- `error`.
+    """Every matrix is a convex combination of `vertices` plus a matrix within +- `error`.
 
-    `vertices` (K, n, n) float64 are the exact ones rounded, and `error` (n, n) bounds the rounding
+    `vertices` (K, k, n) float64 are the exact ones rounded, and `error` (k, n) bounds the rounding
     entry by entry; it is 0 where floats are exact.
     """
 
-    vertices: Array
-    error: Array
-    atoms: tuple[HullAtom, ...]
+    vertices: np.ndarray
+    error: np.ndarray
 
 
 def value_hull(function: _Function, states: Box, inputs: Box, names: Sequence[str] = ()) -> Hull:
@@ -83,11 +64,11 @@ def value_hull(function: _Function, states: Box, inputs: Box, names: Sequence[st
         function: (x (n,), v (m,)) -> (k, l), traceable by JAX.
         states: bounds of x, (n,) each.
         inputs: bounds of v, (m,) each.
-        names: of the entries of x and v, for messages and `atoms`; else x[0], ..., v[0], ...
+        names: of the entries of x and v, for messages; else x[0], ..., v[0], ...
 
     Raises:
-        OpenError: the function depends on an entry that the box leaves open.
-        GainError: a bound is NaN or above its partner, the function has no enclosure on the box
+        UnboundedError: the function depends on an entry that the box leaves open.
+        RangeError: a bound is NaN or above its partner, the function has no enclosure on the box
             (the primitive is named), or there are more than `MOST_VERTICES` vertices.
     """
     atoms = Atoms()
@@ -116,8 +97,8 @@ def slope_hull(
         weight: (x, v) -> (k, l), whose values are appended to the slopes and enclosed jointly.
 
     Raises:
-        OpenError: the slopes depend on an entry that the box leaves open.
-        GainError: as in `value_hull`; or the function or the weight is discontinuous on the box.
+        UnboundedError: the slopes depend on an entry that the box leaves open.
+        RangeError: as in `value_hull`; or the function or the weight is discontinuous on the box.
     """
     atoms = Atoms()
     x, v = _variables(atoms, states, inputs, names)
@@ -167,7 +148,7 @@ def _variables(
     n, m = _count_bounds(states, "x"), _count_bounds(inputs, "v")
     called = list(names) or [f"x[{k}]" for k in range(n)] + [f"v[{k}]" for k in range(m)]
     if len(called) != n + m:
-        raise GainError(f"`names` has {len(called)} entries, and must have {n + m}.")
+        raise RangeError(f"`names` has {len(called)} entries, and must have {n + m}.")
     bounds = [*zip(*states, strict=True), *zip(*inputs, strict=True)]
     result = np.empty(n + m, object)
     for k, (low, high) in enumerate(bounds):
@@ -185,13 +166,13 @@ def _interval(low: float | Fraction, high: float | Fraction) -> Interval | None:
 def _count_bounds(box: Box, name: str) -> int:
     lower, upper = (list(side) for side in box)
     if len(lower) != len(upper):
-        raise GainError(
+        raise RangeError(
             f"the bounds of `{name}` have {len(lower)} and {len(upper)} entries, "
             "and must be two vectors of the same length."
         )
     for k, (low, high) in enumerate(zip(lower, upper, strict=True)):
         if not low <= high:
-            raise GainError(
+            raise RangeError(
                 f"the bounds of `{name}[{k}]` are {float(low):g} and {float(high):g}, "
                 "and must be in rising order."
             )
@@ -213,7 +194,7 @@ def _hull_of(entries: np.ndarray, atoms: Atoms) -> Hull:
     error = np.array([bound for _, _, bound in parts]).reshape(entries.shape)
     # Different products may give equal matrices, and each vertex is a constraint for a solver.
     vertices = np.unique(np.stack(spread, axis=-1), axis=0)
-    return Hull(vertices.reshape(-1, *entries.shape), error, _describe_atoms(atoms, used, counts))
+    return Hull(vertices.reshape(-1, *entries.shape), error)
 
 
 def _round_values(
@@ -228,7 +209,7 @@ def _round_values(
             # Rounded to the nearest float; the exact difference becomes part of `error`.
             rounded[place] = float(exact)
         except OverflowError as fault:
-            raise GainError("an entry of the hull exceeds float64 on the domain.") from fault
+            raise RangeError("an entry of the hull exceeds float64 on the domain.") from fault
         worst = max(worst, abs(Fraction(float(rounded[place])) - exact))
     return values, rounded, float_above(worst + values.slack)
 
@@ -238,16 +219,3 @@ def _expand_values(values: CornerValues, array: np.ndarray, counts: dict[int, in
     shape = [count if atom in values.atoms else 1 for atom, count in counts.items()]
     # An entry is constant along the atoms that it does not use.
     return np.broadcast_to(array.reshape(shape), list(counts.values())).ravel()
-
-
-def _describe_atoms(
-    atoms: Atoms, used: dict[int, set[Exponent]], counts: dict[int, int]
-) -> tuple[HullAtom, ...]:
-    result = []
-    for atom, count in counts.items():
-        source = atoms.known[atom]
-        powers = [e for e in used[atom] if isinstance(e, int)]
-        kind = "arc" if not powers else "interval" if powers == [1] else "powers"
-        low, high = float(source.reach.lo), float(source.reach.hi)
-        result.append(HullAtom(source.name, "constant" if count == 1 else kind, low, high, count))
-    return tuple(result)

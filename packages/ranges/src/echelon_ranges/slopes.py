@@ -11,11 +11,11 @@ from typing import TypeAlias, final
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from echelon.core.enclosure import rules
-from echelon.core.enclosure.atoms import Atoms, Polynomial, constant, divides
-from echelon.core.enclosure.interval import Interval
-from echelon.core.errors import GainError, listing
-from echelon.core.jaxpr import Algebra, Params, Rule, dot, map_entries, reduction
+from echelon_ranges import rules
+from echelon_ranges.atoms import Atoms, Polynomial, constant, divides
+from echelon_ranges.errors import JumpError, RangeError, listing
+from echelon_ranges.interval import Interval
+from echelon_ranges.jaxpr import Algebra, Params, Rule, dot, map_entries, reduction
 
 # ---- values with slopes --------------------------------------------------------------------------
 # A slope of a function is the difference of two values divided by that of the arguments.
@@ -182,7 +182,7 @@ _ANSWERS = bool | np.bool_ | UndecidedComparison
 
 
 def slopes_in(atoms: Atoms) -> Algebra:
-    """Return the algebra of values with slopes; it raises `GainError` where one is missing."""
+    """Return the algebra of values with slopes; it raises `RangeError` where one is missing."""
     bound = {name: functools.partial(rule, atoms) for name, rule in _RULES.items()}
     return Algebra({**bound, **_SUMS}, number, _lift, rules.outside, _fold)
 
@@ -243,10 +243,6 @@ def _absolute(atoms: Atoms, p: Sloped) -> Sloped:
 # ---- comparisons and choices ---------------------------------------------------------------------
 
 
-class JumpError(GainError):
-    """A function may be discontinuous on the box, so it has no slopes there."""
-
-
 def _jump(atoms: Atoms, what: str, *borders: Polynomial) -> JumpError:
     behind = listing(sorted(frozenset[str]().union(*(atoms.sources(d) for d in borders))))
     return JumpError(
@@ -269,7 +265,7 @@ def _comparison(name: str) -> Rule:
 
     def compare(atoms: Atoms, a: object, b: object) -> bool | UndecidedComparison:
         if not (isinstance(a, Sloped) and isinstance(b, Sloped)):
-            raise GainError("the model compares answers that the domain does not decide.")
+            raise RangeError("the model compares answers that the domain does not decide.")
         difference = a - b
         border, reached = difference.value, atoms.range(difference.value)
         if certain(reached) or never(reached):
@@ -392,7 +388,7 @@ def _as_integer(atoms: Atoms, kind: str, entry: _Entry) -> bool | int | Undecide
     if entry.slopes:
         raise _jump(atoms, "a state becomes a whole number", entry.value)
     if value is None:
-        raise GainError(
+        raise RangeError(
             "the model turns a state into a whole number, "
             "which the hull of Jacobians does not know."
         )

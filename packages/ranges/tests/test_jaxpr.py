@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from jax.extend.core import jaxpr_as_fun
 
-from echelon.core import jaxpr
-from echelon.core.jaxpr import Algebra, dot, evaluate, reduction, walk
-from echelon.core.numerics import precision
+from echelon_ranges import jaxpr
+from echelon_ranges.jaxpr import Algebra, dot, evaluate, float64, reduction, walk
 
 
 def refuse(equation, operands):
@@ -143,7 +142,7 @@ BY_JAX = {
 def test_numbers_are_those_of_jax_to_the_bit_and_mostly_without_jax(monkeypatch):
     faults = []
     for name, function in (BY_NUMPY | BY_JAX).items():
-        with precision("float64"), monkeypatch.context() as at:
+        with float64(), monkeypatch.context() as at:
             closed = jax.make_jaxpr(function)(jnp.asarray(X))
             [expected] = jaxpr_as_fun(closed)(jnp.asarray(X))
             if name in BY_NUMPY:

@@ -12,11 +12,20 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from echelon.core.enclosure import rules
-from echelon.core.enclosure.interval import ELEMENTARY, Interval, pi, wave
-from echelon.core.errors import GainError
-from echelon.core.jaxpr import Algebra, Params, Rule, dot, entrywise, map_entries, reduction, walk
-from echelon.core.numerics import precision
+from echelon_ranges import rules
+from echelon_ranges.errors import RangeError
+from echelon_ranges.interval import ELEMENTARY, Interval, pi, wave
+from echelon_ranges.jaxpr import (
+    Algebra,
+    Params,
+    Rule,
+    dot,
+    entrywise,
+    float64,
+    map_entries,
+    reduction,
+    walk,
+)
 
 # ---- series --------------------------------------------------------------------------------------
 # Each entry of a trace is a truncated Taylor series whose coefficients enclose those at every time
@@ -212,17 +221,17 @@ def _sqrt(x: Series) -> Series:
 def _applied(name: str, ends: Ends) -> Ends:
     elementary, x = ELEMENTARY[name], interval_of(ends)
     if not elementary.defined(x):
-        raise GainError(
+        raise RangeError(
             f"a path takes `{name}` of an expression in {x.text()}, which {elementary.domain}."
         )
     return ends_of(elementary.range(x))
 
 
 def power(x: Series, exponent: Series | int) -> Series:
-    """Return x to a constant exponent; raise `GainError` if it varies."""
+    """Return x to a constant exponent; raise `RangeError` if it varies."""
     k = exponent if isinstance(exponent, Series) else number(int(exponent), x.order)
     if k.moves:
-        raise GainError("a path has an exponent that varies in time, which has no enclosure.")
+        raise RangeError("a path has an exponent that varies in time, which has no enclosure.")
     low, high = k.parts[0]
     if low == high and not low % UNIT:
         return whole_power(x, low >> _BITS)
@@ -290,9 +299,9 @@ def _side(x: Series, name: str, edge: bool = True) -> bool:
     raise _changes(name)
 
 
-def _changes(name: str) -> GainError:
+def _changes(name: str) -> RangeError:
     what = f"`{name}`{_WRITTEN.get(name, '')}"
-    return GainError(f"a path uses {what}, and passes from one branch of it to another.")
+    return RangeError(f"a path uses {what}, and passes from one branch of it to another.")
 
 
 _WRITTEN = {"rem": " (of `%` or `mod`)", "ne": " (of `//`, `%` or a comparison)"}
@@ -370,7 +379,7 @@ def _angle_of(y: Series, x: Series) -> Series:
 
 
 def _blocked(params: Params, x: np.ndarray) -> np.ndarray:
-    raise GainError("a path uses `stop_gradient`, behind which its derivatives are not its own.")
+    raise RangeError("a path uses `stop_gradient`, behind which its derivatives are not its own.")
 
 
 BRANCHES: dict[str, Rule] = {
@@ -405,7 +414,7 @@ _HALVED = 2000
 """Pieces that are looked at beside those asked for."""
 
 
-class NoEnclosureError(GainError):
+class NoEnclosureError(RangeError):
     """A function has no enclosure, however short the time."""
 
 
@@ -426,15 +435,15 @@ def enclose_derivatives(
         For each derivative from 0 on, the k intervals.
 
     Raises:
-        GainError: the function has no enclosure there; the primitive is named.
+        RangeError: the function has no enclosure there; the primitive is named.
     """
-    with precision("float64"):
+    with float64():
         closed = jax.make_jaxpr(function)(jnp.zeros(()))
 
     def derivatives(low: Fraction, high: Fraction, order: int) -> list[list[Ends]]:
         t = np.empty((), object)
         t[()] = Series(((down(low), up(high)), *[whole(k == 1) for k in range(1, order + 1)]))
-        with precision("float64"):
+        with float64():
             [result] = walk(closed.jaxpr, closed.consts, [t], _algebra(order))
         rows = [lifted(entry, order).parts for entry in result.ravel()]
         return [
@@ -469,10 +478,10 @@ def enclose_finely(
             [rows] = enclose_derivatives(function, (low, high), order)
         except NoEnclosureError:
             raise
-        except GainError as error:
+        except RangeError as error:
             if high - low < _SHORT or count > len(times) + _HALVED:
                 why, span = str(error).rstrip("."), f"{float(low):.6g} and {float(high):.6g} s"
-                raise GainError(f"{why}, between {span}.") from error
+                raise RangeError(f"{why}, between {span}.") from error
             spans += [((low + high) / 2, high), (low, (low + high) / 2)]
             continue
         yield EnclosedPiece(high, rows)

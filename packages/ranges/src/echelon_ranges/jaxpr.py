@@ -9,20 +9,17 @@ same in every algebra, and are here.
 
 import contextlib
 import functools
+import hashlib
 import math
 import operator
-from collections.abc import Callable, Mapping, Sequence
+import threading
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var
-
-from echelon.core.cache import BoundedCache
-from echelon.core.identity import process_key
-from echelon.core.numerics import precision
-from echelon.core.types import PyTree
 
 Params: TypeAlias = Mapping[str, Any]
 """The parameters of a primitive; each primitive has its own names and types."""
@@ -238,8 +235,17 @@ class Algebra(NamedTuple):
     finish: Callable[[JaxprEqn, list[np.ndarray]], list[np.ndarray]] = lambda _, results: results
 
 
+@contextlib.contextmanager
+def float64() -> Iterator[None]:
+    """Let JAX compute in float64 by its usual rules, whatever flags are set."""
+    # A context and no `jax.config.update`, which would change a global setting.
+    promotion = jax.numpy_dtype_promotion("standard")
+    with jax.enable_x64(True), jax.debug_nans(False), jax.debug_infs(False), promotion:
+        yield
+
+
 def evaluate(
-    function: Callable[..., PyTree], arguments: Sequence[np.ndarray], algebra: Algebra
+    function: Callable[..., Any], arguments: Sequence[np.ndarray], algebra: Algebra
 ) -> list[np.ndarray]:
     """Return the results of a function for JAX, traced in float64, for arrays of entries.
 
@@ -249,7 +255,7 @@ def evaluate(
         algebra: what the function's equations mean for them.
     """
     # A trace holds its constants: in float32 they would be rounded before any rule sees them.
-    with precision("float64"):
+    with float64():
         # Shapes alone shape a trace, so zeros stand for entries that JAX cannot take.
         closed = jax.make_jaxpr(function)(*(jnp.zeros(a.shape) for a in arguments))
         return walk(closed.jaxpr, closed.consts, arguments, algebra)
@@ -294,7 +300,7 @@ def _used(jaxpr: Jaxpr) -> list[JaxprEqn]:
     return result[::-1]
 
 
-def used_leaves(function: Callable[..., PyTree], *arguments: PyTree) -> list[bool]:
+def used_leaves(function: Callable[..., Any], *arguments: Any) -> list[bool]:
     """Return which leaves of the arguments the results of a function for JAX may rest on."""
     jaxpr = jax.make_jaxpr(function)(*arguments).jaxpr
     read = {v for equation in _used(jaxpr) for v in equation.invars if not isinstance(v, Literal)}
@@ -397,8 +403,38 @@ def compute(equation: JaxprEqn, operands: Sequence[np.ndarray]) -> list[np.ndarr
     result = None if rule is None else rule(equation.params, *arrays)
     if result is not None:
         return [np.asarray(result)]
-    key = process_key((name, equation.params, arrays))
-    return _COMPUTED.get_or_make(key, lambda: by_jax(equation, arrays))
+    key = _key_of(equation, arrays)
+    with _LOCK:
+        results = _COMPUTED.pop(key, None)
+    if results is None:
+        results = by_jax(equation, arrays)
+    if key is not None:
+        with _LOCK:
+            # At the end, so that the first one is the least recently used.
+            _COMPUTED[key] = results
+            while len(_COMPUTED) > 256 or _stored_bytes() > 10**7:
+                _COMPUTED.pop(next(iter(_COMPUTED)))
+    return results
+
+
+def _key_of(equation: JaxprEqn, arrays: Sequence[np.ndarray]) -> Hashable | None:
+    """Return a key, equal only for equal operations on equal bits; None where there is none."""
+    # By text too, since 0.0 and -0.0 are equal.
+    params = [
+        (name, value, repr(value) if isinstance(value, float | tuple) else type(value))
+        for name, value in equation.params.items()
+    ]
+    bits = [(str(a.dtype), a.shape, hashlib.sha256(a.tobytes()).digest()) for a in arrays]
+    key = equation.primitive.name, jnp.result_type(float), *params, *bits
+    try:
+        hash(key)
+    except TypeError:
+        return None
+    return key
+
+
+def _stored_bytes() -> int:
+    return sum(array.nbytes for results in _COMPUTED.values() for array in results)
 
 
 def by_jax(equation: JaxprEqn, operands: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -407,8 +443,9 @@ def by_jax(equation: JaxprEqn, operands: Sequence[np.ndarray]) -> list[np.ndarra
     return [np.asarray(r) for r in (results if equation.primitive.multiple_results else [results])]
 
 
-_COMPUTED = BoundedCache[list[np.ndarray]](256, lambda of: sum(a.nbytes for a in of), 10**7)
+_COMPUTED: dict[Hashable, list[np.ndarray]] = {}
 """Results of JAX, which takes up to 60 ms for one; stages of an integrator compute them again."""
+_LOCK = threading.Lock()
 
 
 def _place(

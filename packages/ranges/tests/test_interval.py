@@ -8,8 +8,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from echelon.core.enclosure.atoms import power_points, wave_points
-from echelon.core.enclosure.interval import ELEMENTARY, Interval, circle, outward, pi, point, wave
+from echelon_ranges.atoms import power_points, wave_points
+from echelon_ranges.interval import ELEMENTARY, Interval, circle, outward, pi, point, wave
 
 FRACTIONS = st.fractions(-50, 50, max_denominator=1000)
 TURN = 2.0 * math.pi
@@ -187,3 +187,17 @@ def test_a_single_power_has_its_range_and_several_their_control_points():
         {1: Fraction(1, 2), 2: -2},
         {1: 2, 2: 4},
     ]
+
+
+@given(st.fractions(-(10**12), 10**12, max_denominator=10**12))
+def test_floats_around_a_rational_are_the_nearest_on_either_side(x):
+    low, high = point(x).floats()
+    assert Fraction(low) <= x <= Fraction(high)
+    assert high in (low, math.nextafter(low, math.inf)) and (high == low) == (Fraction(low) == x)
+
+
+@given(st.fractions(0, 10**6, max_denominator=10**9))
+def test_a_root_lies_between_its_bounds_which_are_95_bits_apart_and_is_exact_of_a_square(x):
+    root, square = ELEMENTARY["sqrt"].range(point(x)), ELEMENTARY["sqrt"].range(point(x * x))
+    assert root.lo**2 <= x <= root.hi**2 and root.hi - root.lo <= root.hi / (1 << 94)
+    assert square == point(x) or square.lo < x < square.hi

@@ -11,8 +11,8 @@ from typing import NamedTuple, TypeAlias, final
 
 import numpy as np
 
-from echelon.core.enclosure.interval import ELEMENTARY, Interval, circle, pi, point, wave
-from echelon.core.errors import GainError, listing
+from echelon_ranges.errors import RangeError, UnboundedError, listing
+from echelon_ranges.interval import ELEMENTARY, Interval, circle, pi, point, wave
 
 # ---- polynomials ---------------------------------------------------------------------------------
 # A monomial contains each variable once, as a power x^k, and each angle once, as cos(w theta) or
@@ -324,18 +324,10 @@ class Atom:
 
     @property
     def reach(self) -> Interval:
-        """Return the range; raise `OpenError` if there is none."""
+        """Return the range; raise `UnboundedError` if there is none."""
         if self.interval is None:
-            raise OpenError(self.name)
+            raise UnboundedError(self.name)
         return self.interval
-
-
-class OpenError(GainError):
-    """The range of a variable is needed, but the box leaves it unbounded."""
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-        super().__init__(f"the domain leaves `{name}` unbounded, and must give it a bound.")
 
 
 class Atoms:
@@ -425,12 +417,12 @@ class Atoms:
         return frozenset().union(*(self.known[atom].sources for atom in p.exponents()))
 
     def elementary(self, name: str, p: Polynomial) -> Polynomial:
-        """Return a function of `ELEMENTARY`; `GainError` if it is not defined on the whole box."""
+        """Return a function of `ELEMENTARY`; `RangeError` if it is not defined on the whole box."""
         function, interval = ELEMENTARY[name], self.range(p)
         if not function.defined(interval):
             verb = "divides by" if name == "reciprocal" else f"takes `{name}` of"
             behind = listing(sorted(self.sources(p))) or "constants"
-            raise GainError(
+            raise RangeError(
                 f"the model {verb} an expression of {behind}, which may be "
                 f"anything in {interval.text()} on the domain, and {function.domain}; "
                 "make the domain smaller."
@@ -551,9 +543,9 @@ def _wave_corners(arc: Interval, waves: list[Wave]) -> list[dict[Exponent, Fract
 
 
 def check_count(count: int) -> None:
-    """Raise `GainError` if a hull has more than `MOST_VERTICES` vertices."""
+    """Raise `RangeError` if a hull has more than `MOST_VERTICES` vertices."""
     if count > MOST_VERTICES:
-        raise GainError(
+        raise RangeError(
             f"the hull of Jacobians has {count} vertices, and may have {MOST_VERTICES}; "
             "fix some states or inputs of the domain at one value."
         )

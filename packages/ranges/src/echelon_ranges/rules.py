@@ -5,10 +5,10 @@ from fractions import Fraction
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from echelon.core.enclosure.atoms import Atoms, Polynomial, constant
-from echelon.core.enclosure.interval import Interval
-from echelon.core.errors import GainError
-from echelon.core.jaxpr import compute, map_entries
+from echelon_ranges.atoms import Atoms, Polynomial, constant
+from echelon_ranges.errors import RangeError
+from echelon_ranges.interval import Interval
+from echelon_ranges.jaxpr import compute, map_entries
 
 
 def lift(array: np.ndarray) -> np.ndarray:
@@ -16,23 +16,23 @@ def lift(array: np.ndarray) -> np.ndarray:
     if array.dtype.kind in "biu":
         return array
     if array.dtype.kind == "c":
-        raise GainError("the model is complex, and must be real.")
+        raise RangeError("the model is complex, and must be real.")
     numbers = array.astype(np.float64)
     if not np.isfinite(numbers).all():
-        raise GainError("the model holds a constant that is not finite.")
+        raise RangeError("the model holds a constant that is not finite.")
     return map_entries(constant, numbers)
 
 
 def outside() -> object:
     """Raise an error for a read outside of an array, whose value is unknown."""
-    raise GainError("the model reads outside of an array.")
+    raise RangeError("the model reads outside of an array.")
 
 
 def fold(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
     """Return the float64 results of an unknown primitive whose operands are all constants."""
     values = [map_entries(number, a) if a.dtype == object else a for a in operands]
     if any(v is None for a in values for v in a.flat):
-        raise GainError(
+        raise RangeError(
             f"the model uses `{equation.primitive.name}`, which the hull of "
             "Jacobians does not know; allowed are arithmetic, powers, trigonometric and hyperbolic "
             "functions, exponentials, logarithms, absolute values and choices by `where`."
@@ -62,7 +62,7 @@ def power(atoms: Atoms, p: Polynomial, exponent: Polynomial | int) -> Polynomial
     """Return p to a constant power: integer, 1/2, or exp(k log p)."""
     k = exponent.value() if isinstance(exponent, Polynomial) else Fraction(int(exponent))
     if k is None:
-        raise GainError(
+        raise RangeError(
             "the model raises to a power that varies, which the hull of Jacobians "
             "does not know; write it by `exp` and `log`."
         )
@@ -75,10 +75,10 @@ def power(atoms: Atoms, p: Polynomial, exponent: Polynomial | int) -> Polynomial
 
 
 def atan2(atoms: Atoms, y: Polynomial, x: Polynomial) -> Polynomial:
-    """Return the angle of the point (x, y) for x > 0, else raise `GainError`."""
+    """Return the angle of the point (x, y) for x > 0, else raise `RangeError`."""
     reached = atoms.range(x)
     if reached.lo <= 0:
-        raise GainError(
+        raise RangeError(
             "the model takes `atan2` with a second argument that may be anything "
             f"in {reached.text()} on the domain, and must be positive; make the domain smaller."
         )

@@ -12,8 +12,6 @@ from fractions import Fraction
 from functools import lru_cache
 from typing import NamedTuple
 
-from echelon.core.rational import root_bounds
-
 _BITS = 96  # significant bits of an end that had to be rounded
 _ONE = 1 << 256  # units of the last place in 1, for sums of series
 
@@ -55,6 +53,10 @@ class Interval:
         """Return the common part of two enclosures of the same set."""
         return Interval(max(self.lo, other.lo), min(self.hi, other.hi))
 
+    def floats(self) -> tuple[float, float]:
+        """Return the largest float that is not above the interval, the smallest not below it."""
+        return float_below(self.lo), float_above(self.hi)
+
     def text(self) -> str:
         """Return the ends as decimal text."""
         return f"[{_decimal(self.lo)}, {_decimal(self.hi)}]"
@@ -83,6 +85,29 @@ def _round_end(x: Fraction, up: bool) -> Fraction:
 def outward(lo: Fraction, hi: Fraction) -> Interval:
     """Return an interval around [lo, hi] whose ends are short dyadic rationals."""
     return Interval(_round_end(lo, up=False), _round_end(hi, up=True))
+
+
+def float_below(x: Fraction) -> float:
+    """Return the largest float that is not above x."""
+    near = float(x)
+    # `float` rounds to nearest, and a lower bound must not be rounded up.
+    return near if Fraction(near) <= x else math.nextafter(near, -math.inf)
+
+
+def float_above(x: Fraction) -> float:
+    """Return the smallest float that is not below x."""
+    return -float_below(-x)
+
+
+def root_bounds(x: Fraction) -> tuple[Fraction, Fraction]:
+    """Return short rationals below and above the root of x >= 0; both are equal if it is short."""
+    bits = x.denominator.bit_length() // 2 - x.numerator.bit_length() // 2
+    shift = max(0, _BITS + bits)
+    square = x * (1 << (2 * shift))
+    # isqrt(floor(s)) <= sqrt(s) < isqrt(floor(s)) + 1.
+    low = math.isqrt(math.floor(square))
+    high = low if low * low == square else low + 1
+    return Fraction(low, 1 << shift), Fraction(high, 1 << shift)
 
 
 def inverse(x: Interval) -> Interval:

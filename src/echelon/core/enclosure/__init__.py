@@ -1,1 +1,0 @@
-"""Rigorous enclosures of functions on a box: intervals, curves, polynomials, hulls."""
