@@ -38,6 +38,7 @@ from echelon.synthesis.certificates.jacobians import (
     constant_inputs,
     has_constant_input_map,
     jacobians,
+    unfelt_states,
 )
 from echelon.synthesis.certificates.lmi import falls
 from echelon.synthesis.gains.gain import Gain
@@ -158,13 +159,29 @@ def _contraction(
 
 def _computed(parts: Parts, gain: Gain, claim: RegionCertificate) -> RegionCertificate | None:
     model, spectrum, exact = parts.model, parts.graph.spectrum(), claim.kind is Kind.PROOF
-    domain = claim.domain.straight(model)
+    domain = _opened(model, claim.domain, gain.R)
     if claim.theorem is Theorem.A5:
         hull = jacobians(model, domain)
         if not falls(gain.P, hull.matrices):
             return None
         return drift_region(model, domain, hull, gain.P, gain.coupling, spectrum)
     return _contraction(parts, gain, pairs_on(model, domain, gain.R), exact)
+
+
+def _opened(model: ControlAffine, domain: Domain, R: Array) -> Domain:
+    """Return a domain without the bounds of states on which no slope depends."""
+    free = unfelt_states(model, domain) & np.isfinite(domain.lower) & np.isfinite(domain.upper)
+    if free.any():
+        lower, upper = np.where(free, -np.inf, domain.lower), np.where(free, np.inf, domain.upper)
+        wider = Domain(lower, upper, domain.input_lower, domain.input_upper)
+        here = pairs_on(model, domain, R).jacobians
+        try:
+            there = pairs_on(model, wider, R).jacobians
+        except GainError:
+            return domain.straight(model)
+        if there.kind is here.kind and np.array_equal(there.matrices, here.matrices):
+            domain = wider
+    return domain.straight(model)
 
 
 def _strength(parts: Parts, gain: Gain) -> float:

@@ -80,6 +80,26 @@ def sample_jacobians(
     return samples
 
 
+@memoize
+def unfelt_states(model: ControlAffine, domain: Domain) -> Array:
+    """Return (n,) the states that change no slope of f + g u, nor g, at samples of a domain."""
+    n = len(model.state_names)
+    inside = np.concatenate(domain.sample(_FEW), axis=1)
+    base = np.append(np.asarray(model.trim[0], float), np.zeros(inside.shape[1] - n)) + inside
+
+    def entries(z: jax.Array) -> jax.Array:
+        slopes = jax.jacfwd(velocity_of(model))(z[:n], z[n:])
+        return jnp.append(slopes.ravel(), model.input_map(z[:n]).ravel())
+
+    with precision("float64"):
+        at = jax.jit(jax.vmap(entries))
+        here = np.asarray(at(jnp.asarray(base)))
+        moved = (base + far * np.eye(len(base[0]))[k] for k in range(n) for far in _FAR[:2])
+        there = np.asarray([at(jnp.asarray(z)) for z in moved]).reshape(n, -1, here.shape[1])
+    gaps = np.abs(there - np.tile(here, (2, 1))).max(axis=1)
+    return (gaps <= 1e-12 * np.abs(here).max(axis=0)).all(axis=1)
+
+
 def _units(domain: Domain) -> Array:
     """Return (n + m,) half of the width of the domain in each state and input; 1 where open."""
     low = np.concatenate([domain.lower, domain.input_lower])
