@@ -271,8 +271,10 @@ _SCALES = np.geomspace(0.25, 250.0, 24)
 def attraction(formation: Formation, away: np.ndarray) -> float:
     """Return up to what factor of a deviation errors end; infinite if far beyond limits too."""
     scales = formation.onset(away) * _SCALES
-    for _ in range(2):
+    for first in (True, False):
         ends, _room = formation.outcome(scales[:, None, None] * away)
+        if first and ends[0] is not True:
+            return 0.0  # at the goals held inputs may swing between their limits
         # Where that is not decided the region is taken for larger.
         lost = [k for k, end in enumerate(ends) if end is False]
         if not lost:

@@ -114,6 +114,26 @@ def test_starts_from_which_a_run_enters_the_set_are_covered_although_limits_act(
     assert told.verdict is GuaranteeVerdict.CONDITIONAL and covered(result, told)
 
 
+def test_a_domain_bounds_no_state_on_which_no_slope_depends():
+    """All slopes of a linear model are the same, so its leader may go where it likes."""
+    model, graph = Cart(dimension=2), ech.Graph.path(3)
+    parts, gain = parts_of(model, graph)
+    found = ech.guarantee(parts, SETTINGS)
+    assert found.domain == "all states"
+    # A pendulum's slopes depend on its angle, and not on its rate.
+    swinging = ech.models.Pendulum()
+    domain = {"angle": 0.4, "rate": 0.01}
+    gain = ech.synthesize(swinging, graph, ech.gains.RobustLQR(domain=domain))
+    laws = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain, feedforward="relay"))
+    goals = ech.Formation(np.zeros((3, 2)))
+    found = ech.guarantee(ech.Parts(swinging, graph, goals, laws), SETTINGS)
+    assert found.domain == "angle in [-0.4, 0.4]"
+    # The ellipse touches the border of the domain: r^2 = 0.4^2 / (P^-1)_11.
+    whole = 0.4 / np.sqrt(np.linalg.inv(gain.P)[0, 0])
+    limits = found.hypotheses[Hypothesis.LIMITS].number
+    assert found.certified.radius == pytest.approx(min(whole, limits or np.inf))
+
+
 class Clipped(ech.models.DoubleIntegrator):
     """A limit without `input_limits`."""
 
