@@ -97,6 +97,8 @@ class LocalCertificate(NamedTuple):
         adrift: states that nothing drives to zero, by name.
         steady: whether messages have one age; with others nothing is known of their mixture.
         culprit: what a fault is about, in words; empty for nothing.
+        map: what a step does to errors, by the eigenvalues of what agents hear; None where it is
+            not split by them, or errors do not end.
     """
 
     faults: tuple[Fault, ...]
@@ -111,6 +113,7 @@ class LocalCertificate(NamedTuple):
     adrift: tuple[str, ...] = ()
     steady: bool = True
     culprit: str = ""
+    map: Split | None = None
 
     @property
     def holds(self) -> bool:
@@ -550,6 +553,7 @@ def _judged(
         amplification(split, rest.is_state),
         off=float(gaps.max(initial=0.0)),
         adrift=tuple(dict.fromkeys(names[states[k]] for k in still)),
+        map=None if faults else rest.split,
     )
 
 
