@@ -97,7 +97,7 @@ def test_margins_hold_inside_and_not_outside_for_every_follower(seed, count, hig
     K = B.T @ P
     low, top = within(A, K, B, lost, high)
     weights = np.sort(np.append([low, top], np.random.default_rng(0).uniform(low, top, count - 2)))
-    dt = 0.01
+    dt = 0.0001
     found = ech.check(parts_of(A, B, P, star(weights)), ech.Settings(1.0, dt)).lines
     lines = {line.statement: line for line in found}
     lower, upper = (float(x) for x in lines[Topic.GAIN].number_text.split(" to "))

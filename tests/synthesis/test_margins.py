@@ -19,6 +19,7 @@ from echelon.synthesis.certificates.margins import (
     invariant_ellipsoid,
     modes,
     peak_gain,
+    slowest_between,
     stiffness,
     string_gain,
 )

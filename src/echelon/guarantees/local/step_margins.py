@@ -14,6 +14,7 @@ from echelon.core.linear import spectral_radii, symmetric_basis
 from echelon.core.rational import bisect
 from echelon.core.types import Array
 from echelon.guarantees.local.spectra import Split, blocks_of
+from echelon.guarantees.messages.own_delay import angles_beside, last_delay
 
 # ---- factors -------------------------------------------------------------------------------------
 # Of factors k a mode of M = F + k lambda K passes the unit circle only where the product of two of
@@ -130,8 +131,6 @@ _RANK = 1e-12
 """Relative, of a singular value."""
 _MOST, _EACH = 10_000, 20
 """Delays up to which are looked at, in steps: every one up to the second, then every tenth part."""
-_ALONG, _NEAR, _CLOSE = 1000, 40, 0.1
-"""Points of half a circle, twice, and beside each eigenvalue so near to it."""
 _TURN, _SMALL, _ROUNDS, _CHUNK = 1.0, 0.1, 8, 32
 """rad from a point to the next; where it is more, points are added, so many times, but for loci
 that are smaller than the second number. Eigenvalues looked at together."""
@@ -154,11 +153,7 @@ class DelayMargin(NamedTuple):
 def delay_margin(split: Split) -> DelayMargin:
     """Return how many steps all disagreements may be late, in the steps that run."""
     loci = [_Locus(F, K, split) for F, K in _driven(split)]
-
-    def decays(steps: int) -> bool:
-        return all(locus.decays(steps) for locus in loci)
-
-    steps = _longest(decays)
+    steps = last_delay(lambda d: all(locus.decays(d) for locus in loci), _MOST, _EACH)
     if steps == _MOST or steps < 0:
         return DelayMargin(steps, steps == _MOST, None)
     values = split.eigenvalues
@@ -166,22 +161,6 @@ def delay_margin(split: Split) -> DelayMargin:
     radii = [max(locus.radius(k, steps + 1) for locus in loci) for k in few]
     worst = complex(few[int(np.argmax(radii))])
     return DelayMargin(steps, False, worst if worst.imag else worst.real)
-
-
-def _longest(decays: Callable[[int], bool]) -> int:
-    """Return the last delay with which all that are tried decay; -1 for none."""
-    last = -1
-    while last < _MOST:
-        more = min(_MOST, last + 1 + (last // 10 if last >= _EACH else 0))
-        if decays(more):
-            last = more
-            continue
-        # The last one that decays, between one that does and one that does not.
-        while more - last > 1:
-            middle = (last + more) // 2
-            last, more = (middle, more) if decays(middle) else (last, middle)
-        break
-    return last
 
 
 class _Locus:
@@ -198,7 +177,7 @@ class _Locus:
         self._M = F + self._middle * K
         modes = np.linalg.eigvals(self._M)
         self._stable = bool((np.abs(modes) < 1.0).all())
-        self._angles = _angles(modes)
+        self._angles = angles_beside(modes)
         self._T = self._response(self._angles)
 
     def _response(self, angles: Array) -> Array:
@@ -266,12 +245,3 @@ class _Locus:
             whole[n : n + r, :n] = self._V
             whole[n + r :, n:-r] = np.eye(r * (delay - 1))
         return float(spectral_radii(whole))
-
-
-def _angles(modes: Array) -> Array:
-    """Return angles from 0 to pi, closer to each other near eigenvalues by the circle."""
-    half = np.linspace(0.0, np.pi, _ALONG), np.geomspace(1e-12, np.pi, _ALONG)
-    near = modes[(np.abs(np.abs(modes) - 1.0) < _CLOSE) & (np.imag(modes) >= 0.0)]
-    widths = np.maximum(np.abs(np.abs(near) - 1.0), 1e-9)[:, None] * np.geomspace(0.01, 100, _NEAR)
-    beside = (np.angle(near)[:, None] + np.hstack([-widths, widths])).reshape(-1)
-    return np.unique(np.concatenate([*half, beside[(beside > 0.0) & (beside < np.pi)]]))
