@@ -18,8 +18,6 @@ from echelon.agents.models.linearization import linearize
 from echelon.core.numerics import precision
 from echelon.synthesis.certificates.margins import (
     ClosedLoop,
-    delay_margin,
-    gain_margin,
     invariant_ellipsoid,
     peak_gain,
     string_gain,
@@ -73,8 +71,6 @@ def main() -> None:
     loop = ClosedLoop(A, B, gain.P, gain.R, gain.coupling, GRAPH.spectrum().eigenvalues)
     push = np.eye(len(A))[:, 3:6]
     for name, act in {
-        "gain margin": lambda: gain_margin(loop),
-        "delay margin": lambda: delay_margin(loop),
         "string gain": lambda: string_gain(loop),
         "disturbance, ellipsoid": lambda: invariant_ellipsoid(loop, push),
         "disturbance, exact L1": lambda: peak_gain(loop, push),

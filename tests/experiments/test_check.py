@@ -321,7 +321,8 @@ def test_a_long_path_says_which_eigenvalues_it_looked_at():
     graph, step = {"name": "path", "agents": 601}, {"horizon": 1.0, "dt": 1e-6}
     lines, found = checked({}, graph=graph, model=SINGLE, simulation=step)
     assert "over 1200 modes of the steps that run" in lines["disagreement decays"].text
-    assert lines["delay margin"].text.endswith("lambda_min, lambda_max and 30 values between them")
+    where = lines["disturbance, network"].text
+    assert where.endswith("lambda_min, lambda_max and 30 values between them")
     assert found.promised
     # Margins are not asked for where rounding hides the slowest mode.
     strong = {"gain": {"method": "riccati", "coupling": 1e11}}

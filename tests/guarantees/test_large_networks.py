@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import scipy.linalg
-from held_loops import delayed_growth, growth, radii
+from held_loops import growth, radii
 
 import echelon as ech
 from echelon.core.linear import discretize
@@ -97,19 +97,26 @@ def test_margins_hold_inside_and_not_outside_for_every_follower(seed, count, hig
     K = B.T @ P
     low, top = within(A, K, B, lost, high)
     weights = np.sort(np.append([low, top], np.random.default_rng(0).uniform(low, top, count - 2)))
-    found = ech.check(parts_of(A, B, P, star(weights)), ech.Settings(1.0, 0.001)).lines
+    dt = 0.0001
+    found = ech.check(parts_of(A, B, P, star(weights)), ech.Settings(1.0, dt)).lines
     lines = {line.statement: line for line in found}
     lower, upper = (float(x) for x in lines[Topic.GAIN].number_text.split(" to "))
     for factor, inside in ((lower, 1.01), (upper, 0.99)):
         if 0.0 < factor < np.inf:
             # Three digits are shown.
-            assert growth(A, B, K, inside * factor * weights).max() < 0.0
-            assert growth(A, B, K, (2.0 - inside) * factor * weights).max() > 0.0
-    delay = lines[Topic.DELAY].number
-    some = weights[np.linspace(0, count - 1, 150).astype(int)]
-    for factor, decays in ((0.99, True), (1.01, False)):
-        worst = max(delayed_growth(A, k * B @ K, factor * delay) for k in some)
-        assert (worst < 0.0) == decays or count > 150 and not decays
+            assert radii(A, B, K, inside * factor * weights, dt).max() < 1.0
+            assert radii(A, B, K, (2.0 - inside) * factor * weights, dt).max() > 1.0
+    steps, some = (
+        round(lines[Topic.DELAY].number / dt),
+        weights[np.linspace(0, count - 1, 30).astype(int)],
+    )
+    F, G = discretize(A, B, dt)
+    for late, decays in ((steps, True), (steps + 1, False)):
+        whole = np.zeros((len(some), *[3 * (late + 1)] * 2))
+        whole[:, :3, :3], whole[:, 3:, : 3 * late] = F, np.eye(3 * late)
+        whole[:, :3, 3 * late :] -= some[:, None, None] * (G @ K)
+        worst = np.abs(np.linalg.eigvals(whole)).max()
+        assert (worst < 1.0) == decays or count > 30 and not decays
 
 
 @pytest.mark.parametrize("shift", [0.3, 0.0])

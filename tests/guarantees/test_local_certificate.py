@@ -215,6 +215,38 @@ def test_of_a_graph_that_switches_the_last_one_decides_or_the_product():
     assert found.radius == pytest.approx(radius(whole) ** (1 / 40), rel=1e-12)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["undirected", "rings", "last"])
+def test_large_formations_split_as_the_whole_matrix_does(kind):
+    random, agents, model = np.random.default_rng(3), 390, ech.models.DoubleIntegrator(dimension=2)
+    tree = [(int(random.integers(k)), k) for k in range(1, agents)]
+    more = random.integers(1, agents, (300, 2)).tolist()
+    links = sorted({(min(e), max(e)) for e in [*tree, *more] if e[0] != e[1]})
+    back = [(j, i) for i, j in links if i and random.random() < 0.5]
+    graph = once = ech.Graph(links, [0], agents)
+    if kind == "rings":
+        graph = once = ech.Graph([*links, *back], [0], agents, directed=True)
+    if kind == "last":
+        graph = ech.Graph.switching([(0.0, tree), (0.1, links)], [0], agents)
+    one = np.eye(2)
+    P, K = np.kron([[2.0, 1.0], [1.0, 2.0]], one), 0.5 * np.kron([[1.0, 2.0]], one)
+    gain = ech.gains.FixedGain(P=P.tolist(), coupling=0.5)
+    law = ech.laws.Consensus(ech.synthesize(model, graph, gain), feedforward="relay")
+    found = certificate(model, graph, law)
+    cart = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
+    F, G = held(*(np.kron(part, one) for part in cart), SETTINGS.dt)
+    L = grounded(once)
+    values, vectors = np.linalg.eig(L)
+    modes, shapes = np.linalg.eig(F - values[:, None, None] * (G @ K))
+    k, j = np.unravel_index(np.abs(modes).argmax(), modes.shape)
+    slowest = np.kron(vectors[:, k], shapes[k][:, j])
+    whole = np.kron(np.eye(len(L)), F) - np.kron(L, G @ K)
+    assert np.linalg.norm(whole @ slowest - modes[k, j] * slowest) < 1e-9
+    assert found.split
+    assert found.radius == pytest.approx(abs(modes[k, j]), rel=1e-9)
+    assert found.exact == pytest.approx(found.radius, rel=1e-9)
+
+
 def test_agents_unlike_each_other_have_one_matrix():
     graph, dt = ech.Graph.path(4), SETTINGS.dt
     found = certificate(Rover(), graph, Pull(), world=ech.World(plants={2: Rover(0.4)}))

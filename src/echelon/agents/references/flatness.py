@@ -15,7 +15,7 @@ from echelon.core.cache import memoize
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import LawError, PlanError
 from echelon.core.numerics import precision
-from echelon.core.types import Array, State
+from echelon.core.types import Array, Input, State
 
 # ---- states and inputs ---------------------------------------------------------------------------
 
@@ -216,13 +216,19 @@ def without_heading(
     if not isinstance(reference, Reference) or model.flat_order < 1:
         return np.zeros(len(times), bool)
     with precision("float64"):
-        rest = model.flat(jnp.zeros((model.flat_order + 1, len(model.flat_outputs))))
+        rest = _flat(model, np.zeros((model.flat_order + 1, len(model.flat_outputs))))
         if all(np.isfinite(part).all() for part in rest):
             return np.zeros(len(times), bool)
         rates = [
             np.asarray(_derivative(reference, times, (name,), 1)) for name in model.flat_outputs
         ]
     return np.linalg.norm(rates, axis=0) <= _AT_REST
+
+
+@cached_jit
+def _flat(model: ControlAffine, derivatives: Array) -> tuple[State, Input]:
+    # Compiled, since its derivatives one operation at a time take most of a second.
+    return model.flat(jnp.asarray(derivatives))
 
 
 def _turned_over(model: ControlAffine, reference: LeaderPath, horizon: float) -> Iterator[str]:

@@ -15,13 +15,15 @@ from echelon.core.types import Array, JsonObject
 from echelon.core.words import Feedforward, Kind, amount
 from echelon.experiments.studies.assumptions import drift_lines, graph_lines
 from echelon.experiments.studies.observed_region import ObservedRegion
+from echelon.guarantees.local.spectra import Split
+from echelon.guarantees.local.step_margins import delay_margin, gain_margin
 from echelon.guarantees.promises.closed_loop import LinearLoop
 from echelon.guarantees.promises.promise import AgreementModes, Guarantee, guarantee
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates import margins
-from echelon.synthesis.certificates.margins import delay_margin, invariant_ellipsoid, peak_gain
+from echelon.synthesis.certificates.margins import invariant_ellipsoid, peak_gain
 
 # ---- stability margins of the linearized loop ----------------------------------------------------
 
@@ -32,7 +34,7 @@ _STIFF = 1e10
 """Ratio of modes above which the slowest one has fewer than six digits."""
 
 
-def margin_lines(parts: Parts, promise: Guarantee) -> Iterator[Statement]:
+def margin_lines(parts: Parts, settings: Settings, promise: Guarantee) -> Iterator[Statement]:
     """Yield the margins of a stable loop."""
     loop = promise.loop
     if parts.graph.schedule is not None:
@@ -59,20 +61,33 @@ def margin_lines(parts: Parts, promise: Guarantee) -> Iterator[Statement]:
         text = f"the fastest mode is {ratio} times the slowest, which is lost in rounding"
         yield unneeded(Topic.MARGINS, _KIND, text, stiffness)
         return
-    low, high = margins.gain_margin(loop.closed)
-    text = "factors on the coupling, in continuous time"
-    yield holds(Topic.GAIN, _KIND, text, low, f"{at_least(low)} to {at_most(high)}")
-    delay = delay_margin(loop.closed)
-    time = f"{at_most(1e3 * delay.delay)} ms" if np.isfinite(delay.delay) else "any"
-    text = f"uniform delay of z, critical mode lambda = {about(delay.eigenvalue)}; {loop.where}"
-    yield holds(Topic.DELAY, _KIND, text, delay.delay, time)
-    low, high = loop.certificate.lambda_min, loop.certificate.lambda_max
-    best = delay_margin(loop.closed._replace(eigenvalues=np.array([low]))).delay
-    yield _spread_line(low, high, delay.delay, best)
+    yield from _step_lines(promise.steps, settings.dt)
     yield _scaling_line(parts.model, loop)
     # The bound for the network needs a symmetric matrix.
     yield from _disturbance_lines(parts.model, loop) if loop.symmetric else ()
     yield from _string_line(parts, loop)
+
+
+def _step_lines(steps: Split | None, dt: float) -> Iterator[Statement]:
+    """Yield by how much z may be scaled or late, in the steps that run."""
+    factors = None if steps is None else gain_margin(steps)
+    if steps is None or factors is None:
+        text = "the steps that run do not split into modes of the graph that decay"
+        yield from (unneeded(name, _KIND, text) for name in (Topic.GAIN, Topic.DELAY))
+        return
+    text = "factors on the disagreement, as on the coupling, in the steps that run"
+    shown = f"{at_least(factors.low)} to {at_most(factors.high)}"
+    yield holds(Topic.GAIN, _KIND, text, factors.low, shown)
+    delay, low = delay_margin(steps), np.real(steps.eigenvalues).min()
+    if delay.eigenvalue is None:
+        text = f"z late by {amount(delay.steps, 'step')} of {dt:g} s, and no more were tried"
+    else:
+        text = f"z late by whole steps, up to {amount(delay.steps, 'step')} of {dt:g} s; one more"
+        text += f" is too late for lambda = {about(delay.eigenvalue)}"
+    yield holds(Topic.DELAY, _KIND, text, delay.steps * dt, f"{about(1e3 * delay.steps * dt)} ms")
+    best = delay_margin(steps._replace(eigenvalues=np.array([low]), between=False))
+    high = np.abs(steps.eigenvalues).max()
+    yield _spread_line(float(low), float(high), delay.steps * dt, best.steps * dt)
 
 
 def _switching_lines(promise: Guarantee) -> Iterator[Statement]:
@@ -222,6 +237,6 @@ def check(parts: Parts, settings: Settings) -> CheckResult:
             *graph_lines(parts),
             *drift_lines(parts, settings, stated),
             *stated.hypotheses.values(),
-            *margin_lines(parts, stated),
+            *margin_lines(parts, settings, stated),
         )
     return CheckResult(lines, stated, warnings)

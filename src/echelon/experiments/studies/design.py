@@ -20,14 +20,13 @@ from echelon.experiments.scenario.named_class import resolve
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.experiments.scenario.sections import GainSpec
 from echelon.experiments.scenario.yaml import ScenarioFault
+from echelon.guarantees.local.step_margins import GainMargin, delay_margin, gain_margin
 from echelon.guarantees.promises.promise import Guarantee, guarantee
 from echelon.laws.consensus import Consensus
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.settings import Settings
-from echelon.synthesis.certificates import margins
 from echelon.synthesis.certificates.domain import Domain
-from echelon.synthesis.certificates.margins import delay_margin
 from echelon.synthesis.gains.gain import FixedGain, Gain, Method, synthesize
 from echelon.synthesis.gains.riccati import InnerLoop
 
@@ -40,8 +39,9 @@ class Design(NamedTuple):
         parts: of the scenario with that gain.
         fastest: largest modulus of a pole of the loop, 1/s.
         step: the longest sampling period (s) for which all checked modes remain stable.
-        factors: the interval of stable factors on the coupling; None if unstable.
-        delay: the largest stable delay of all disagreements, s; None if unstable.
+        factors: the interval of factors on the coupling with which the steps that run decay; None
+            if they do not, or agents do not split by the graph.
+        delay: by how much all disagreements may be late in them, s, in whole steps; None likewise.
         seconds: computing time of the synthesis.
     """
 
@@ -52,7 +52,7 @@ class Design(NamedTuple):
     reason: str = ""
     fastest: float | None = None
     step: float = 0.0
-    factors: margins.GainMargin | None = None
+    factors: GainMargin | None = None
     delay: float | None = None
     seconds: float = 0.0
 
@@ -260,11 +260,11 @@ def _evaluate(gain: Gain, parts: Parts, settings: Settings, guarantee: Guarantee
     design = Design(gain.method, gain, parts, guarantee, fastest=float(np.abs(poles).max()))
     if not (loop.every and guarantee.linear):
         return design if guarantee.linear else design._replace(fastest=None)
-    return design._replace(
-        step=guarantee.longest_step(settings),
-        factors=margins.gain_margin(closed),
-        delay=delay_margin(closed).delay,
-    )
+    design, steps = design._replace(step=guarantee.longest_step(settings)), guarantee.steps
+    factors = None if steps is None else gain_margin(steps)
+    if steps is None or factors is None:
+        return design
+    return design._replace(factors=factors, delay=delay_margin(steps).steps * settings.dt)
 
 
 def _arguments(method: type[Method], spec: GainSpec | None, parts: Parts) -> dict[str, Any]:

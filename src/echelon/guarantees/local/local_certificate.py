@@ -30,8 +30,10 @@ from echelon.guarantees.local.resting_loop import (
     period_of,
     reacts,
     reals,
-    responses,
     resting_loop,
+    slopes_along,
+    values_after,
+    with_reals,
 )
 from echelon.guarantees.local.spectra import Split, amplification, modes_of
 from echelon.laws.law import Feeds, Law, LocalView, Memory, Speaks
@@ -95,6 +97,8 @@ class LocalCertificate(NamedTuple):
         adrift: states that nothing drives to zero, by name.
         steady: whether messages have one age; with others nothing is known of their mixture.
         culprit: what a fault is about, in words; empty for nothing.
+        map: what a step does to errors, by the eigenvalues of what agents hear; None where it is
+            not split by them, or errors do not end.
     """
 
     faults: tuple[Fault, ...]
@@ -109,6 +113,7 @@ class LocalCertificate(NamedTuple):
     adrift: tuple[str, ...] = ()
     steady: bool = True
     culprit: str = ""
+    map: Split | None = None
 
     @property
     def holds(self) -> bool:
@@ -163,11 +168,16 @@ def _until_last(
     steps = int(schedule.switches(dt, 2.0 * float(schedule.starts[-1]))[0][-1])
     loop = resting_loop(prepared, None, steps + 1)
     early = rest._replace(loop=loop, now=begun(loop, goals, np.asarray(0)))
-    directions = rest.rows if rest.whole is None else np.eye(len(rest.value))
-    after, slopes = _maps(early, directions, steps)
+    if rest.whole is None:
+        start = reals(early.now)
+        start[rest.free] = rest.value
+        moved = with_reals(early.now, jnp.asarray(start))
+        after, slopes = reals(later(loop, moved, np.asarray(steps)))[rest.free], None
+    else:
+        after, slopes = _maps(early, np.eye(len(rest.value)), steps)
     if not (np.abs(after - rest.value) <= _AT_REST * _scale(rest.value)).all():
         return found._replace(faults=(Fault.NO_REST,), radius=None)
-    if rest.whole is None:
+    if slopes is None:
         return found
     at = rest.body.state[rest.free] >= 0
     before = np.linalg.norm(slopes.T[at][:, at], 2) if np.isfinite(slopes).all() else np.inf
@@ -270,10 +280,12 @@ class _Rest(NamedTuple):
         value: (d,) theirs.
         residual: what a period changes at most, in `_scale` of each number.
         movers: (A,) the agents that may move.
+        links: C (A, A), what they hear; None where they are not alike.
         size: s of a body; 0 where agents have bodies of different sizes.
         split: the map, by what agents hear; None where they are not alike.
         whole: (d, d) the map of everything; None of one that is split, or too large.
         common: the radius of what all do alike, where nobody is led.
+        probes: random directions (K, d) and the derivative along them, of one that is split.
     """
 
     loop: Loop
@@ -284,16 +296,12 @@ class _Rest(NamedTuple):
     value: Array
     residual: float
     movers: Array
+    links: sp.csr_array | None
     size: int
     split: Split | None
     whole: Array | None
     common: float = 0.0
-
-    @property
-    def rows(self) -> Array:
-        """Directions (K, d) of as many rows as one compiled program takes."""
-        count = 2 * self.size + _PROBES if self.whole is None else len(self.value)
-        return np.zeros((count, len(self.value)))
+    probes: tuple[Array, Array] | None = None
 
     @property
     def map(self) -> Split | None:
@@ -317,20 +325,29 @@ def _rest_of(loop: Loop, now: LoopState, movers: Array, period: int, graph: Grap
     free = np.concatenate([*mine, shared])
     sizes = {len(each) for each in mine}
     size = sizes.pop() if len(sizes) == 1 else 0
-    rest = _Rest(loop, graph, now, body, free, reals(now)[free], np.inf, movers, size, None, None)
-    alike = size and not len(shared) and period == 1 and _links_of(rest) is not None
+    links = _links_of(loop, movers) if size and not len(shared) and period == 1 else None
+    value, known = reals(now)[free], (None, None)
+    rest = _Rest(loop, graph, now, body, free, value, np.inf, movers, links, size, *known)
     if len(free) > _DENSE:
-        return _split_at(_settled(rest), period) if alike else rest
+        return rest if links is None else _split_at(_settled(rest), period)
     rest = _by_newton(rest, period)
-    return _split_at(rest, period) if alike and len(movers) > 1 else rest
+    return rest if links is None or len(movers) == 1 else _split_at(rest, period)
 
 
 def _maps(rest: _Rest, directions: Array, period: int) -> tuple[Array, Array]:
     """Return the numbers (d,) a period later, and the derivative along directions (K, d)."""
-    bases = np.tile(rest.value, (len(directions), 1))
-    rows = rest.free, bases, directions, np.asarray(period)
-    values, slopes = map(np.asarray, responses(rest.loop, rest.now, *rows))
+    rows = rest.free, rest.value, directions, np.asarray(period)
+    values, slopes = map(np.asarray, slopes_along(rest.loop, rest.now, *rows))
     return values[0], slopes
+
+
+def _values(rest: _Rest, bases: Array, period: int) -> Array:
+    """Return where numbers are a period later, from each of K values (K, d)."""
+    # One shape, and so one program.
+    count = max(_PROBES, len(bases))
+    rows = np.concatenate([bases, np.tile(rest.value, (count - len(bases), 1))])
+    after = values_after(rest.loop, rest.now, rest.free, rows, np.asarray(period))
+    return np.asarray(after)[: len(bases)]
 
 
 def _by_newton(rest: _Rest, period: int) -> _Rest:
@@ -355,12 +372,11 @@ def _by_newton(rest: _Rest, period: int) -> _Rest:
 def _settled(rest: _Rest) -> _Rest:
     """Return a moment that a step leaves as it is, or that of agents left alone for long."""
     for steps in (0, _WARM):
-        now = later(rest.loop, rest.now, np.asarray(steps))
-        after = later(rest.loop, now, np.asarray(1))
-        value, then = reals(now)[rest.free], reals(after)[rest.free]
-        residual = float((np.abs(then - value) / _scale(value)).max())
-        rest = rest._replace(now=now, value=value, residual=residual)
-        if residual <= _AT_REST:
+        now = later(rest.loop, rest.now, np.asarray(steps)) if steps else rest.now
+        rest = rest._replace(now=now, value=reals(now)[rest.free])
+        moved = np.abs(_values(rest, rest.value[None], 1)[0] - rest.value)
+        rest = rest._replace(residual=float((moved / _scale(rest.value)).max()))
+        if rest.residual <= _AT_REST:
             break
     return rest
 
@@ -368,23 +384,23 @@ def _settled(rest: _Rest) -> _Rest:
 # ---- agents that are alike -----------------------------------------------------------------------
 
 
-def _links_of(rest: _Rest) -> sp.csr_array | None:
+def _links_of(loop: Loop, movers: Array) -> sp.csr_array | None:
     """Return C (A, A) of the agents that may move: what they hear; None of weights that change."""
-    exchange = rest.loop.graph.exchange
+    exchange = loop.graph.exchange
     weights = np.asarray(exchange.weights, float)
     if weights.ndim > 1:
         return None
-    place = np.full(rest.loop.agents, -1)
-    place[rest.movers] = np.arange(len(rest.movers))
+    place = np.full(loop.agents, -1)
+    place[movers] = np.arange(len(movers))
     to, of = place[np.asarray(exchange.receivers)], place[np.asarray(exchange.senders)]
-    heard, inside, count = to >= 0, (to >= 0) & (of >= 0), len(rest.movers)
+    heard, inside, count = to >= 0, (to >= 0) & (of >= 0), len(movers)
     rows = np.concatenate([to[heard], to[inside]]), np.concatenate([to[heard], of[inside]])
     C = sp.csr_array((np.concatenate([weights[heard], -weights[inside]]), rows), (count, count))
-    told = by_depth(rest.loop)
+    told = by_depth(loop)
     if told is None or count > _ALL:
         return C
     # What each is sent by its parent adds up along the tree (theory page, T4).
-    parent, own = place[np.asarray(told.parents)[rest.movers]], np.arange(count)
+    parent, own = place[np.asarray(told.parents)[movers]], np.arange(count)
     below = own[parent >= 0]
     tree = sp.csc_array((np.ones(len(below)), (below, parent[below])), (count, count))
     return sp.csr_array(spla.spsolve(sp.csc_array(sp.eye_array(count) - tree), sp.csc_array(C)))
@@ -392,7 +408,7 @@ def _links_of(rest: _Rest) -> sp.csr_array | None:
 
 def _split_at(rest: _Rest, period: int) -> _Rest:
     """Return the map by what agents hear, if the whole one is that; else the rest as it is."""
-    C, size, count = _links_of(rest), rest.size, len(rest.movers)
+    C, size, count = rest.links, rest.size, len(rest.movers)
     assert C is not None
     known, rest = rest.split, rest._replace(split=None)
     own, apart = C.diagonal(), sp.csc_array(C - sp.diags_array(C.diagonal()))
@@ -430,7 +446,8 @@ def _split_at(rest: _Rest, period: int) -> _Rest:
         return rest
     # Where nobody is led all move alike with F alone, which must not carry them away.
     common = 0.0 if grounded else modes_of(Split.whole(F)).radius
-    return rest._replace(split=Split(F, K, *values), common=common)
+    probes = random, slopes[2 * size :]
+    return rest._replace(split=Split(F, K, *values), common=common, probes=probes)
 
 
 def _eigenvalues(C: sp.csr_array, grounded: bool, graph: Graph) -> tuple[Array, bool] | None:
@@ -488,7 +505,7 @@ def _stays_elsewhere(rest: _Rest, places: tuple[int, ...], period: int) -> bool:
     for size in _ELSEWHERE:
         value = rest.value.copy()
         value[spread] += size * _scale(value[spread])
-        after, _ = _maps(rest._replace(value=value), rest.rows, period)
+        after = _values(rest, value[None], period)[0]
         if not np.array_equal(after[spread], value[spread]):
             return False
     return True
@@ -536,6 +553,7 @@ def _judged(
         amplification(split, rest.is_state),
         off=float(gaps.max(initial=0.0)),
         adrift=tuple(dict.fromkeys(names[states[k]] for k in still)),
+        map=None if faults else rest.split,
     )
 
 
@@ -567,21 +585,24 @@ def _sides(rest: _Rest, period: int, margin: float, foreign: bool) -> Fault | No
     What the derivative leaves of a smooth function shrinks faster than the change. Rounding hides
     nothing in echelon's own code, and a model's kinks are looked for where it is checked.
     """
-    random = np.random.default_rng(1).standard_normal(rest.rows.shape)
-    sets = [random] if rest.whole is None else [random, np.eye(len(rest.value))]
+    if rest.whole is None:
+        assert rest.probes is not None
+        # Of many agents that are alike each one is a sample.
+        sets = [rest.probes]
+    else:
+        random = np.random.default_rng(1).standard_normal(rest.whole.shape)
+        sets = [(along, along @ rest.whole.T) for along in (random, np.eye(len(random)))]
     matters = _LEAST * min(max(margin, 1e-9), 1.0)
     rounding = 1e2 * np.finfo(float).eps * np.maximum(1.0, np.abs(rest.value)) / _SIZES[1]
     if rest.split is None and rest.whole is not None:
         rounding = np.maximum(rounding, np.abs(rest.whole) @ rounding)
     if foreign and 0.0 < margin and not (rounding <= matters).all():
         return Fault.UNDECIDED
-    for along in sets:
-        slopes, left = _maps(rest, along, period)[1], []
+    for along, slopes in sets:
+        left = list[Array]()
         for size in _SIZES:
             for side in (size, -size):
-                bases = rest.value + side * along
-                rows = rest.free, bases, np.zeros_like(bases), np.asarray(period)
-                there = np.asarray(responses(rest.loop, rest.now, *rows)[0])
+                there = _values(rest, rest.value + side * along, period)
                 left.append(np.abs((there - rest.value) / side - slopes))
         large, small = np.maximum(*left[:2]), np.maximum(*left[2:])
         if not np.isfinite(small).all():

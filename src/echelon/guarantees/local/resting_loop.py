@@ -7,6 +7,7 @@ else is what runs: laws, their memories, limits, motors, estimators, the ages of
 import dataclasses
 import functools
 import math
+from collections.abc import Callable
 from typing import NamedTuple, final
 
 import jax
@@ -17,7 +18,7 @@ from jaxtyping import Float
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.references.reference import LeaderPath
-from echelon.core.compiled import cached_jit
+from echelon.core.compiled import cached_jit, compiled_for_one_call
 from echelon.core.numerics import Field
 from echelon.core.types import Array, Input, PyTree, Scalar, State
 from echelon.laws.law import Expected, Law, LocalView, Memory, Speaks, Travels, reference_of
@@ -302,7 +303,7 @@ def with_reals(now: LoopState, values: jax.Array) -> LoopState:
     return tree.unflatten([next(moved) if is_real(leaf) else leaf for leaf in leaves])
 
 
-@cached_jit
+@compiled_for_one_call
 def begun(loop: Loop, states: Array, steps: Array) -> LoopState:
     """Return the moment so many steps after a beginning at states (N, n)."""
     return jax.lax.fori_loop(0, steps, lambda _, now: step(loop, now), begin(loop, states))
@@ -318,20 +319,10 @@ _NUMBERS = 2_000_000
 """Of all rows that are computed at a time."""
 
 
-@cached_jit
-def responses(
-    loop: Loop, now: LoopState, free: Array, bases: Array, directions: Array, steps: Array
-) -> tuple[jax.Array, jax.Array]:
-    """Return where numbers are after some steps, and the derivative along directions, (K, d).
-
-    Args:
-        loop: what runs.
-        now: the moment from which.
-        free: (d,) the places of the numbers that may move.
-        bases: (K, d) their values.
-        directions: (K, d).
-        steps: how many.
-    """
+def _moved(
+    loop: Loop, now: LoopState, free: Array, steps: Array
+) -> tuple[Callable[[jax.Array], jax.Array], int]:
+    """Return where numbers (d,) are after some steps, and how many there are at most in a row."""
     rest = jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(now) if is_real(x)])
 
     def moved(values: jax.Array) -> jax.Array:
@@ -339,8 +330,31 @@ def responses(
         end = jax.lax.fori_loop(0, steps, lambda _, now: step(loop, now), start)
         return jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(end) if is_real(x)])[free]
 
-    def one(row: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        return jax.jvp(moved, row[:1], row[1:])
-
     # As many rows at a time as memory takes.
-    return jax.lax.map(one, (bases, directions), batch_size=max(1, _NUMBERS // len(rest)))
+    return moved, max(1, _NUMBERS // len(rest))
+
+
+@compiled_for_one_call
+def slopes_along(
+    loop: Loop, now: LoopState, free: Array, base: Array, directions: Array, steps: Array
+) -> tuple[jax.Array, jax.Array]:
+    """Return where numbers are after some steps, and the derivative along directions, (K, d) each.
+
+    Args:
+        loop: what runs.
+        now: the moment from which.
+        free: (d,) the places of the numbers that may move.
+        base: (d,) their values, the same for all directions: only slopes are computed K times.
+        directions: (K, d).
+        steps: how many.
+    """
+    moved, rows = _moved(loop, now, free, steps)
+    start = (jnp.asarray(base),)
+    return jax.lax.map(lambda d: jax.jvp(moved, start, (d,)), directions, batch_size=rows)
+
+
+@compiled_for_one_call
+def values_after(loop: Loop, now: LoopState, free: Array, bases: Array, steps: Array) -> jax.Array:
+    """Return where numbers are after some steps from each of K values (K, d), likewise."""
+    moved, rows = _moved(loop, now, free, steps)
+    return jax.lax.map(moved, bases, batch_size=rows)

@@ -79,7 +79,7 @@ def modes_of(split: Split) -> Modes:
     """
     pattern = (split.F != 0.0) | (split.K != 0.0)
     values, unsure, lasting, loose = [np.zeros(0)], [np.zeros(0)], list[int](), list[int]()
-    for places in _blocks(pattern):
+    for places in blocks_of(split):
         first = int(places[0])
         if len(places) == 1 and split.F[first, first] == 1.0 and split.K[first, first] == 0.0:
             read = np.count_nonzero(pattern[:, first]) > 1
@@ -96,8 +96,9 @@ def modes_of(split: Split) -> Modes:
     return Modes(np.concatenate(values), np.concatenate(unsure), (*lasting,), (*loose,))
 
 
-def _blocks(pattern: Array) -> list[Array]:
-    """Return the strongly connected parts of a map, (D, D) of who acts on whom."""
+def blocks_of(split: Split) -> list[Array]:
+    """Return the places of the strongly connected parts of a map, by who acts on whom."""
+    pattern = (split.F != 0.0) | (split.K != 0.0)
     count, block = csgraph.connected_components(sp.csr_array(pattern), connection="strong")
     order = np.argsort(block, kind="stable")
     return np.split(order, np.searchsorted(block[order], np.arange(1, count)))

@@ -4,6 +4,7 @@ One agent's step is linearized at the trim as it runs: law, memory, motors and i
 model as the law knows it.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -37,10 +38,8 @@ EDGE = 1.0 - 1e-9
 """Of a spectral radius: what rounding leaves of 1."""
 _DECAYED, _LONGEST = 1e-6, 50_000
 """Of a response, beyond which it is not summed, and after how many steps nothing is known of it."""
-_ALONG, _NEAR = 1000, 40
-"""Points of half a circle, twice, and beside each eigenvalue near it."""
-_CLOSE = 0.1
-"""To the circle; eigenvalues that are closer turn quickly."""
+_ALONG, _NEAR, _CLOSE = 1000, 40, 0.1
+"""Points of half a circle, twice, and beside each eigenvalue so near to it."""
 _TURN, _ROUNDS = 1.0, 6
 """rad from a point to the next; where it is more, points are added, so many times."""
 _CHUNK = 32
@@ -122,7 +121,7 @@ def all_decay(step: LateStep, own: Array, between: bool, delay: int) -> bool:
         delay: in steps.
     """
     alone = np.linalg.eigvals(step.loop(0.0, delay))
-    values = _resolved(step, own, delay, _angles(alone))
+    values = _resolved(step, own, delay, angles_beside(alone))
     turns, most = _turns(values, own)
     smooth = (most <= _TURN).all() and (turns == (np.abs(alone) >= EDGE).sum()).all()
     return bool(smooth and (not between or _joined(values, own)))
@@ -143,10 +142,10 @@ def _resolved(step: LateStep, own: Array, delay: int, angles: Array) -> Array:
     return values
 
 
-def _angles(alone: Array) -> Array:
+def angles_beside(modes: Array) -> Array:
     """Return angles from 0 to pi, closer to each other near eigenvalues by the circle."""
     half = np.linspace(0.0, np.pi, _ALONG), np.geomspace(1e-12, np.pi, _ALONG)
-    near = alone[(np.abs(np.abs(alone) - 1.0) < _CLOSE) & (np.imag(alone) >= 0.0)]
+    near = modes[(np.abs(np.abs(modes) - 1.0) < _CLOSE) & (np.imag(modes) >= 0.0)]
     widths = np.maximum(np.abs(np.abs(near) - 1.0), 1e-9)[:, None] * np.geomspace(0.01, 100, _NEAR)
     beside = (np.angle(near)[:, None] + np.hstack([-widths, widths])).reshape(-1)
     return np.unique(np.concatenate([*half, beside[(beside > 0.0) & (beside < np.pi)]]))
@@ -240,18 +239,26 @@ def own_delay_line(case: OwnCase) -> Statement | None:
 
 def longest_delay(case: OwnCase, step: LateStep) -> int:
     """Return up to which delay, in steps, the loop decays; -1 for none."""
-    last, size = -1, len(step.A)
-    most = min(round(_MOST / case.problem.settings.dt), (_LARGEST - size) // step.states)
+    most = min(round(_MOST / case.problem.settings.dt), (_LARGEST - len(step.A)) // step.states)
+    return last_delay(lambda delay: _decays(case, step, delay), most, _EACH)
+
+
+def last_delay(decays: Callable[[int], bool], most: int, each: int) -> int:
+    """Return the last delay with which all that are tried decay; -1 for none.
+
+    Up to `each` all are tried, and then every tenth part of it, up to `most`.
+    """
+    last = -1
     while last < most:
-        # Every one at first, and then every tenth part of it.
-        more = min(most, last + 1 + max(last, 0) // _EACH)
-        if not _decays(case, step, more):
-            # The last one that decays, between one that does and one that does not.
-            while more - last > 1:
-                middle = (last + more) // 2
-                last, more = (middle, more) if _decays(case, step, middle) else (last, middle)
-            return last
-        last = more
+        more = min(most, last + 1 + (last // 10 if last >= each else 0))
+        if decays(more):
+            last = more
+            continue
+        # The last one that decays, between one that does and one that does not.
+        while more - last > 1:
+            middle = (last + more) // 2
+            last, more = (middle, more) if decays(middle) else (last, middle)
+        break
     return last
 
 

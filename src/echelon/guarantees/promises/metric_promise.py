@@ -16,6 +16,7 @@ from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array
 from echelon.core.words import Kind, Theorem
 from echelon.guarantees.local.local_certificate import local_certificate
+from echelon.guarantees.local.spectra import Split
 from echelon.guarantees.promises.case import GuaranteeInputs
 from echelon.guarantees.promises.closed_loop import LinearLoop, grounded_slowest, loop_of
 from echelon.guarantees.promises.frozen_laws import frozen_of
@@ -222,6 +223,11 @@ class MetricPromise(Guarantee):
         rate = None if local is None else local.rate(self.case.settings.dt)
         own = -math.inf if rate is None else -rate
         return max(own, self.case.leaders_share)
+
+    @property
+    def steps(self) -> Split | None:
+        """What the steps that run do to small errors that end; None where it is not known."""
+        return None if self.case.local is None else self.case.local.map
 
     def longest_step(self, settings: Settings) -> float:
         """Return the longest step (s) with which modes decay at the trim."""

@@ -22,6 +22,7 @@ from echelon.core.statement import Cause, Hypothesis, Statement
 from echelon.core.trace import shared_traces
 from echelon.core.types import Array
 from echelon.core.words import GuaranteeVerdict, Kind, Theorem, Verdict
+from echelon.guarantees.local.spectra import Split
 from echelon.guarantees.promises.closed_loop import LinearLoop
 from echelon.guarantees.promises.region import CertifiedSet
 from echelon.laws.law import Law
@@ -145,6 +146,11 @@ class Guarantee(abc.ABC):
     @property
     def agreement(self) -> AgreementModes | None:
         """Signals on which agents agree, whose margins stand for the loop's; None without any."""
+        return None
+
+    @property
+    def steps(self) -> Split | None:
+        """What the steps that run do to small errors that end; None where it is not known."""
         return None
 
     @property
