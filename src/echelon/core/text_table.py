@@ -127,7 +127,26 @@ class TextTable(NamedTuple):
 
     def has(self, column: Column) -> bool:
         """Tell whether the header names a column."""
-        return self.head is not None and _index(self, self.head, column) is not None
+        return self.find(column) is not None
+
+    def find(self, column: Column) -> int | None:
+        """Return the number of a column, from 0; None where the header does not name it.
+
+        Raises:
+            EchelonError: the header names it twice.
+        """
+        if self.head is None:
+            return None
+        found = [(k, _stated(cell, column)) for k, cell in enumerate(self.head.cells)]
+        ranks = [(stated[0], k) for k, stated in found if stated is not None]
+        best = [k for rank, k in ranks if rank == min(ranks)[0]]
+        if len(best) > 1:
+            cells = listing(self.head.cells[k] for k in best)
+            raise self.fault(
+                f"{self.place(self.head.line)} has {cells} for `{column.name}`, and must have one "
+                "column for it."
+            )
+        return best[0] if best else None
 
     def columns(self, wanted: Sequence[Column], least: int = 1) -> Columns:
         """Return the numbers of the wanted columns, in their order; others are not read.
@@ -138,7 +157,7 @@ class TextTable(NamedTuple):
         """
         table = self._with_header(wanted)
         assert table.head is not None
-        places = [_index(table, table.head, column) for column in wanted]
+        places = [table.find(column) for column in wanted]
         units = [_scale(table, c, k) for c, k in zip(wanted, places, strict=True)]
         self._check_rows(least, len(table.head.cells))
         values = np.zeros((len(self.rows), len(wanted)))
@@ -299,7 +318,7 @@ def _headed(rows: list[_Row]) -> tuple[_Row | None, list[_Row]]:
 
 
 def _is_value(cell: str) -> bool:
-    return not cell or cell.lower() in ("nan", "inf", "-inf") or _parsed(cell) is not None
+    return not cell or cell.lower() in ("nan", "inf", "-inf") or number_in(cell) is not None
 
 
 # ---- columns, units, numbers ---------------------------------------------------------------------
@@ -327,20 +346,6 @@ def _stated(cell: str, column: Column) -> tuple[int, str | None] | None:
         if name == column.name or plain in names:
             return 0 if name == column.name else 1 + names.index(plain), unit
     return None
-
-
-def _index(table: TextTable, head: _Row, column: Column) -> int | None:
-    """Return the number of a column in the file; None where it is absent."""
-    found = [(k, _stated(cell, column)) for k, cell in enumerate(head.cells)]
-    ranks = [(stated[0], k) for k, stated in found if stated is not None]
-    best = [k for rank, k in ranks if rank == min(ranks)[0]]
-    if len(best) > 1:
-        cells = listing(head.cells[k] for k in best)
-        raise table.fault(
-            f"{table.place(head.line)} has {cells} for `{column.name}`, and must have one column "
-            "for it."
-        )
-    return best[0] if best else None
 
 
 def _scale(table: TextTable, column: Column, k: int | None) -> tuple[float, bool]:
@@ -375,7 +380,7 @@ def _measure(text: str) -> tuple[Counter[str], float] | None:
     return Counter({unit: power for unit, power in base.items() if power}), size
 
 
-def _parsed(cell: str) -> float | None:
+def number_in(cell: str) -> float | None:
     """Return the number in a cell, or the seconds of a date in ISO 8601; None for anything else."""
     text = cell.replace("\u2212", "-")
     if _NUMBER.fullmatch(text):
@@ -393,7 +398,7 @@ def seconds_of(date: str) -> float:
 
 def _number(table: TextTable, column: Column, row: _Row, k: int) -> float:
     cell = row.cells[k]
-    value = _parsed(cell)
+    value = number_in(cell)
     thousands = table.delimiter == "," and _THOUSANDS.fullmatch(cell)
     date = value is not None and ":" in cell and column.unit != "s"
     if value is None or not math.isfinite(value) or thousands or date:

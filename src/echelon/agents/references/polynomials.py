@@ -164,7 +164,9 @@ class Waypoints(PolynomialPath):
             degrees: whether a yaw without a unit is in degrees.
             columns: names of the columns, instead of the file's.
             begin: time of the first point, s; by default the file's, and 0 for Unix time stamps.
-            ends, smooth, resample: as of the class.
+            ends: as of the class, likewise the next two.
+            smooth: m.
+            resample: s.
             model: that a missing `z` is remarked for.
 
         Raises:

@@ -98,8 +98,8 @@ def _least_squares(
     # At rest where the first four coefficients, and the last four, are equal.
     column = np.clip(np.arange(n) - tied // 2, 0, n - tied - 1)
     ties = csr_array((np.ones(n), (np.arange(n), column)), shape=(n, n - tied))
-    design = csr_array(BSpline.design_matrix(at, whole, 7)) @ ties
-    solved = spsolve((design.T @ design).tocsc(), design.T @ points)
+    design: Any = csr_array(BSpline.design_matrix(at, whole, 7)) @ ties
+    solved: Any = spsolve((design.T @ design).tocsc(), design.T @ points)
     return whole, ties @ np.reshape(solved, (-1, points.shape[1]))
 
 

@@ -160,7 +160,7 @@ class _Builder:
             lambda: Settings(**numbers, seed=scenario.seed, steady_window=window), "simulation"
         )
         self.model = self.part(self._model, "model")
-        self.graph = self.part(lambda: _graph(scenario.graph), "graph")
+        self.graph = self.part(lambda: _graph(scenario.graph, scenario.folder), "graph")
         self.reference = self.part(self._reference, "reference")
         self.settle()
 
@@ -481,7 +481,9 @@ class _Builder:
         return events
 
 
-def _graph(spec: GraphSpec) -> Graph:
+def _graph(spec: GraphSpec, folder: Path) -> Graph:
+    if spec.file is not None:
+        return Graph.read(folder / spec.file, spec.leaders, spec.directed or None)
     if spec.edges is not None:
         rest = spec.leaders, spec.agents, spec.directed
         if spec.schedule:

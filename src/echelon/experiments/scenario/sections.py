@@ -104,13 +104,13 @@ class StretchSpec(Section):
 
 
 @final
-class GraphSpec(Section, **either("edges", "name")):
-    """The communication graph: a list of edges, or the name of a generated graph.
+class GraphSpec(Section, **either("edges", "name", "file")):
+    """The communication graph: a list of edges, the name of a generated graph, or a file.
 
     Agents are numbered from 0.
     """
 
-    one_of: ClassVar = ("edges", "name")
+    one_of: ClassVar = ("edges", "name", "file")
     edges: Edges | None = None
     """Edges `[i, j]` or `[i, j, weight]`; the weight has no unit, default 1. Each end receives from
     the other, unless `directed`."""
@@ -128,6 +128,10 @@ class GraphSpec(Section, **either("edges", "name")):
     """Period with which the edges of the `schedule` repeat, s."""
     name: Annotated[str, OneOf(registry.GRAPHS)] | None = None
     """Name of a generated graph; the keys below are its parameters."""
+    file: str | None = None
+    """File of the graph, relative to the scenario file: a table of edges (from, to, weight) or an
+    adjacency matrix, GraphML, or a sparse matrix of SciPy (`.npz`). With `directed` every edge is
+    directed; without, GraphML says so, or a matrix that is not symmetric."""
     agents: Annotated[
         Count | None,
         TakenBy("edges", "grid", needed_by=("path", "ring", "star", "complete", "geometric")),
