@@ -117,7 +117,10 @@ FAULTS = [
     (GOOD + "2,0,0\n", ":4` has 3 numbers, separated by commas, and must have 5."),
     (GOOD + "1,0,0,1,0\n", "`t` of the path at `{}:4` is 1 s, and must be more"),
     ("", "the path `{}` has no line of numbers."),
-    ("a;b\n0;0\n", "`a`, `b`, separated by semicolons; needed are `t`, `x`, `y` (`z`, `yaw` may be"),
+    (
+        "a;b\n0;0\n",
+        "`a`, `b`, separated by semicolons; needed are `t`, `x`, `y` (`z`, `yaw` may be",
+    ),
     ("t,x,y,z\n0,0,0,1\n", "must have from 2 to 100000 lines of numbers, and has 1."),
     ("t,x\0", "path"),
     ("t,x,y,z\n" + "0,0,0,1\n" * 100_001, "and has more than 100000."),

@@ -155,44 +155,50 @@ class TextTable(NamedTuple):
             EchelonError: a column is missing, is there twice or has another unit; a cell is no
                 finite number; there are too few or too many rows.
         """
-        table = self._with_header(wanted)
-        assert table.head is not None
+        table = self.headed(wanted)
+        if table.head is None or not all(table.has(c) for c in wanted if not c.optional):
+            raise self.fault(table._lacks(wanted))
         places = [table.find(column) for column in wanted]
         units = [_scale(table, c, k) for c, k in zip(wanted, places, strict=True)]
-        self._check_rows(least, len(table.head.cells))
-        values = np.zeros((len(self.rows), len(wanted)))
+        table._check_rows(least, len(table.head.cells))
+        values = np.zeros((len(table.rows), len(wanted)))
         for j, (column, k) in enumerate(zip(wanted, places, strict=True)):
             if k is not None:
-                values[:, j] = [_number(table, column, row, k) for row in self.rows]
-        _check_decimals(self, [k for k in places if k is not None])
+                values[:, j] = [_number(table, column, row, k) for row in table.rows]
+        _check_decimals(table, [k for k in places if k is not None])
         values *= [factor for factor, _ in units]
         absent = tuple(c.name for c, k in zip(wanted, places, strict=True) if k is None)
         unitless = tuple(c.name for c, (_, stated) in zip(wanted, units, strict=True) if not stated)
-        return Columns(values, [row.line for row in self.rows], absent, unitless)
+        return Columns(values, [row.line for row in table.rows], absent, unitless)
 
-    def _with_header(self, wanted: Sequence[Column]) -> "TextTable":
-        """Return the table with a header that names the wanted columns."""
+    def headed(self, wanted: Sequence[Column]) -> "TextTable":
+        """Return the table with a header that names the wanted columns; itself if there is none.
+
+        NumPy and ROS write the header as a comment, and instruments write lines before it.
+        """
+        tables = [self, *(self._replace(head=row) for row in reversed(self.remarks))]
+        first = [] if self.head is None else enumerate(self.rows[:_SAMPLE], 1)
+        tables += [self._replace(head=row, rows=self.rows[k:]) for k, row in first]
         needed = [column for column in wanted if not column.optional]
-        # NumPy and ROS write the header as a comment.
-        remarks = [self._replace(head=row) for row in reversed(self.remarks)]
-        tables = [self] if self.head is not None else remarks
-        for table in tables:
-            if all(table.has(column) for column in needed):
-                return table
+        found = (table for table in tables if all(table.has(column) for column in needed))
+        return next(found, self)
+
+    def _lacks(self, wanted: Sequence[Column]) -> str:
+        """Return the sentence on columns that are missing, with what was seen."""
+        needed = [column for column in wanted if not column.optional]
         optional = [column.name for column in wanted if column.optional]
         free = f" ({listing(optional)} may be left out)" if optional else ""
+        every = f"{listing(column.name for column in needed)}{free}"
         if self.head is None:
             first = self.rows[0]
-            raise self.fault(
+            return (
                 f"{self.place(first.line)} has {amount(len(first.cells), 'column')} of numbers, "
-                f"{self.separated}, without names; name them in `columns`: "
-                f"{listing(column.name for column in needed)}{free}."
+                f"{self.separated}, without names; name them in `columns`: {every}."
             )
         lacks = listing(column.name for column in needed if not self.has(column))
-        raise self.fault(
+        return (
             f"{self.place(self.head.line)} lacks {lacks}: it names "
-            f"{listing(self.head.cells[:12])}, {self.separated}; needed are "
-            f"{listing(column.name for column in needed)}{free}."
+            f"{listing(self.head.cells[:12])}, {self.separated}; needed are {every}."
         )
 
     def _check_rows(self, least: int, width: int) -> None:

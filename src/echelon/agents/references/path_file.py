@@ -11,12 +11,27 @@ from echelon.core.errors import ReferenceError
 from echelon.core.text_table import Column, Columns, read_table, read_text, seconds_of
 from echelon.core.types import Array, PathLike
 
-_TIME = Column("t", "s", ("time", "timestamp", "time_stamp", "stamp", "secs", "seconds"))
-_OTHERS = ("pos_{}", "position_{}", "p_{}", "p{}", "{}_pos", "pose_position_{}", "t{}")
+_TIME = Column(
+    "t", "s", ("time", "timestamp", "elapsed", "time_stamp", "stamp", "sec", "secs", "seconds")
+)
+_OTHERS = (
+    *(
+        "pos{}",
+        "pos_{}",
+        "position_{}",
+        "pose_position_{}",
+        "field_pose_pose_position_{}",
+        "p_{}",
+        "p{}",
+    ),
+    *("{}_pos", "{}_position", "stateestimate_{}", "p_rs_r_{}", "t{}"),
+)
 _PLACE = [
     Column(axis, "m", tuple(other.format(axis) for other in _OTHERS), optional=axis == "z")
     for axis in "xyz"
 ]
+_TURNED = Column("qw", "", ("q_w", "orientation_w", "pose_orientation_w", "q_rs_w", "heading"))
+"""What states an orientation that is not read."""
 _YAW = Column("yaw", "rad", ("yaw_angle", "psi", "theta"), optional=True)
 _EARTH = [
     Column("lat", "rad", ("latitude", "gps_lat"), "deg"),
@@ -66,13 +81,18 @@ def read_points(
         ReferenceError: the file cannot be read, lacks a column, or a line is wrong.
     """
     yaw = _YAW._replace(assumed="deg") if degrees else _YAW
+    unread = ""
     if str(file).lower().endswith(".gpx"):
         read, on_earth = _read_gpx(file), True
     else:
-        table = read_table(file, "path", ReferenceError).named(columns)
+        table = read_table(file, "path", ReferenceError).named(columns).headed([_TIME])
+        if table.head is not None and (k := table.find(_TURNED)) is not None:
+            unread = table.head.cells[k]
         on_earth = not table.has(_PLACE[0]) and table.has(_EARTH[0]) and table.has(_EARTH[1])
         read = table.columns([_TIME, *(_EARTH if on_earth else _PLACE), yaw], least=2)
     times, notes = _clock(file, read, begin)
+    if turned := read.absent.count("yaw") and unread:
+        notes.append(f"the path `{file}` has `{turned}`, which is not read: the yaw is 0.")
     place, angle = read.values[:, 1:4], read.values[:, 4]
     if on_earth:
         place = _east_north_up(file, place, read.lines, "alt" not in read.absent)
