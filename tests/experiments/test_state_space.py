@@ -72,7 +72,7 @@ def test_the_system_is_written_with_its_names(tmp_path):
     parts = led_by(ech.models.DoubleIntegrator(2), ech.references.Circle())
     system = ech.state_space(parts, tmp_path / "loop.mat")
     content = loadmat(tmp_path / "loop.mat")
-    for name, matrix in system._asdict().items():
+    for name, matrix in zip("ABCD", system, strict=True):
         assert (content[name] == matrix).all()
     first = [content[name][0, 0][0] for name in ("states", "inputs", "outputs")]
     assert first == ["x_0", "path_x", "error_x_0"]
