@@ -45,7 +45,7 @@ READ = {
     ),
     # Delimiters.
     "blanks": ("t x y z\n0 0.5 -1.25 1\n2.5 1.5 0.25 2", END),
-    "runs of blanks": ("  t     x      y    z\n  0.0  0.5  -1.25  1.0\n  2.5  1.5   0.25  2.0", END),
+    "runs of blanks": ("  t     x    y    z\n  0.0  0.5  -1.25  1\n  2.5  1.5   0.25  2", END),
     "commas and blanks": ("t, x, y, z\n0, 0.5, -1.25, 1\n2.5, 1.5, 0.25, 2", END),
     "bars": ("t|x|y|z\n0|0.5|-1.25|1\n2.5|1.5|0.25|2", END),
     "tabs and decimal commas": ("t\tx\ty\tz\n0\t0,5\t-1,25\t1\n2,5\t1,5\t0,25\t2", END),
@@ -84,7 +84,7 @@ READ = {
     ),
     "a ground robot's theta": ("t,x,y,theta\n0,0,0,0\n2.5,1.5,0.25,0.5", (*PLANAR[:4], 0.5)),
     "lines before the header": ("Recorder 3, site A\nDate: today\nt,x,y,z\n" + ROWS, END),
-    "a commented header of commas": ("#timestamp [s], p_RS_R_x [m], p_RS_R_y [m]\n" "0,0,0\n2.5,1.5,.25", PLANAR),
+    "a commented header of commas": ("#stamp [s], p_RS_R_x, p_RS_R_y\n0,0,0\n2.5,1.5,.25", PLANAR),
     "an index without a name": (",t,x,y,z\n0,0,0,0,1\n1,2.5,1.5,0.25,2", END),
     "text beside the numbers": ("mode,t,x,y,z\nidle,0,0,0,1\nfly,2.5,1.5,0.25,2", END),
     "names given instead": ("a,b,c,d\n" + ROWS, END, {"columns": ("t", "x", "y", "z")}),
@@ -92,7 +92,10 @@ READ = {
     "lines of Windows": (("t,x,y,z\n" + ROWS).replace("\n", "\r\n"), END),
     "lines of an old Mac": (("t,x,y,z\n" + ROWS).replace("\n", "\r"), END),
     "a byte order mark": ("\ufefft,x,y,z\n" + ROWS, END),
-    "cp1252": (("# Weg \u00fcber H\u00f6fe\nt,x,y,z,yaw [\u00b0]\n0,0,0,1,0\n2.5,1.5,.25,2,90").encode("cp1252"), (*END[:4], TURN)),
+    "cp1252": (
+        "# H\u00f6he\nt,x,y,z,yaw [\u00b0]\n0,0,0,1,0\n2.5,1.5,.25,2,90".encode("cp1252"),
+        (*END[:4], TURN),
+    ),
     "UTF-16": (("t\tx\ty\tz\n" + ROWS.replace(",", "\t")).encode("utf-16"), END),
     "empty lines": ("\n\nt,x,y,z\n\n0,0,0,1\n\n\n2.5,1.5,0.25,2\n\n", END),
     "lines of delimiters alone": ("t,x,y,z\n0,0,0,1\n,,,\n2.5,1.5,0.25,2\n,,,", END),
@@ -126,7 +129,7 @@ REFUSED = {
     "time that goes back": ("t,x,y\n0,0,0\n2,1,1\n1,1,1", "`t` of the path at `{}:4` is 1 s, and"),
     "a line too short": ("t,x,y\n0,0,0\n1,1", ":3` has 2 numbers, separated by commas, and must"),
     "one line": ("t,x,y\n0,0,0", "must have from 2 to 100000 lines of numbers, and has 1."),
-    "too few names": (ROWS, "`columns` has 2 names, and the path at `{}:1` has 4", {"columns": "tx"}),
+    "too few names": (ROWS, "`columns` has 2 names, and the path at `{}:1`", {"columns": "tx"}),
     "no text": (b"t,x\x00y\n", "is not a text file."),
     "a date where a place is": ("t,x,y\n0,0,2024-05-01 12:00\n1,1,1", "`y` of the path at `{}:2`"),
 }  # fmt: skip

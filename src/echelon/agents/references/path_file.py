@@ -2,7 +2,7 @@
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -124,6 +124,16 @@ def read_timed(
     read = table.columns([time, *wanted], least=2)
     times, notes = _clock(file, read, begin)
     return PathRows(times, read.values[:, 1:], tuple(notes))
+
+
+_Path = TypeVar("_Path")
+
+
+def noted(path: _Path, notes: tuple[str, ...]) -> _Path:
+    """Return a path that was just made, whose field `notes` is that of its file."""
+    # No argument of its class: a scenario would offer it.
+    object.__setattr__(path, "notes", notes)
+    return path
 
 
 def _clock(file: PathLike, read: Columns, begin: float | None) -> tuple[Array, list[str]]:

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from echelon.agents.models.heading_symmetry import heading_of, rest_heading
 from echelon.agents.models.model import ControlAffine
-from echelon.agents.references.path_file import read_points, yaw_notes
+from echelon.agents.references.path_file import noted, read_points, yaw_notes
 from echelon.agents.references.reference import COORDINATES, Reference, numbers_of
 from echelon.agents.references.spline import ENDS, near, resampled, through
 from echelon.core.compiled import cached_jit
@@ -100,7 +100,6 @@ class Waypoints(PolynomialPath):
         smooth: largest distance (m, and rad of the yaw) of a smoother curve from the points; by
             default the curve passes through them.
         resample: step of points (s) that replace the given ones, on straight lines between them.
-        notes: of a file, what is probably not meant, a sentence each.
 
     Raises:
         ReferenceError: the times do not increase, points or yaw do not match them, or no smooth
@@ -121,7 +120,6 @@ class Waypoints(PolynomialPath):
         ends: str | None = None,
         smooth: float | None = None,
         resample: float | None = None,
-        notes: tuple[str, ...] | None = None,
     ) -> None:
         t, p = _checked_points(times, points)
         ends = ("rest" if smooth is None else "free") if ends is None else ends
@@ -133,7 +131,7 @@ class Waypoints(PolynomialPath):
                 )
         rows = np.column_stack([p, _yaws(yaw, degrees, t)])
         self.ends = ends
-        self.notes = yaw_notes("`Waypoints`", rows[:, 3], degrees) if notes is None else notes
+        self.notes = yaw_notes("`Waypoints`", rows[:, 3], degrees)
         t, rows = (t, rows) if resample is None else resampled(t, rows, resample)
         fit = through(t, rows, ends) if smooth is None else near(t, rows, ends, smooth)
         self.knots, self.coefficients = fit
@@ -174,7 +172,7 @@ class Waypoints(PolynomialPath):
         """
         spatial = model is not None and "z" in model.flat_outputs
         times, values, notes = read_points(file, degrees, columns, begin, spatial)
-        return cls(times, values[:, :3], values[:, 3], False, ends, smooth, resample, notes)
+        return noted(cls(times, values[:, :3], values[:, 3], False, ends, smooth, resample), notes)
 
     def variants(self) -> Iterator[tuple[str, str, "Waypoints"]]:
         """Yield what forces motion, and the same points without it: free ends, a smooth curve."""

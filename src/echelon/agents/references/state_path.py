@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
-from echelon.agents.references.path_file import read_timed
+from echelon.agents.references.path_file import noted, read_timed
 from echelon.agents.references.reference import LeaderPath, numbers_of
 from echelon.core.errors import LawError, ReferenceError, listing
 from echelon.core.text_table import Column
@@ -30,7 +30,6 @@ class StatePath(LeaderPath):
         times: K >= 2 increasing times, s.
         states: K states (n,), in the order of the model's `state_names` and in their units.
         inputs: K inputs (m,), likewise.
-        notes: what its file has that is probably not meant, a sentence each.
 
     Raises:
         ReferenceError: the times do not increase, or states or inputs do not match them.
@@ -39,12 +38,10 @@ class StatePath(LeaderPath):
     times: Array
     states: Array
     inputs: Array
-    notes: tuple[str, ...] = eqx.field(static=True, default=())
+    notes: tuple[str, ...] = eqx.field(static=True)
 
-    def __init__(
-        self, times: Sequence[float], states: _Rows, inputs: _Rows, notes: tuple[str, ...] = ()
-    ) -> None:
-        self.notes = notes
+    def __init__(self, times: Sequence[float], states: _Rows, inputs: _Rows) -> None:
+        self.notes = ()
         self.times = numbers_of(times)
         if self.times.ndim != 1 or len(self.times) < 2 or not (np.diff(self.times) > 0).all():
             raise ReferenceError(
@@ -79,7 +76,8 @@ class StatePath(LeaderPath):
         wanted = [Column(name, unit) for name, unit in zip(names, units, strict=True)]
         times, values, notes = read_timed(file, wanted, columns, begin)
         states, inputs = np.split(values, [len(model.state_names)], axis=1)
-        return cls(times, states, inputs, notes)  # pyright: ignore[reportArgumentType]
+        path = cls(times, states, inputs)  # pyright: ignore[reportArgumentType]
+        return noted(path, notes)
 
     def span(self) -> tuple[float, float]:
         """Return the times of the first and the last knot, s."""

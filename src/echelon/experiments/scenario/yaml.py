@@ -184,7 +184,7 @@ def key_of(key: object, text: str) -> str | int:
     """Return a key as a whole number if it is one, or its text, as in JSON; else as text."""
     if type(key) is int:
         return key
-    return int(text) if re.fullmatch("[0-9]{1,9}", text) else text
+    return int(text) if re.fullmatch("0|[1-9][0-9]{0,8}", text) else text
 
 
 def plain(value: object) -> Any:
@@ -223,8 +223,6 @@ def _replace(
     copy: Any = dict(at or {}) if at is None or isinstance(at, dict) else at
     key: Any = rest[0]
     if isinstance(copy, dict):
-        # a whole number is an int key (an agent), unless the mapping has it as text already
-        key = str(key) if str(key) in copy else key
         copy.setdefault(key)
     elif isinstance(copy, list) and isinstance(key, int) and key < len(copy):
         copy = list(copy)
