@@ -85,7 +85,7 @@ def test_points_are_resampled_on_straight_lines():
         ({"smooth": 0}, "`smooth` of `Waypoints` is 0, and must be a positive number."),
         ({"resample": math.inf}, "`resample` of `Waypoints` is inf, and must be"),
         ({"smooth": 1e-9}, "`smooth` is 1e-09 m, and no smooth curve stays within it"),
-        ({"smooth": 0.1, "resample": 1.0}, "`smooth` needs 16 or more points, and there are 3."),
+        ({"smooth": 0.1, "resample": 1.0}, "and it needs 16 or more points, and there are 3;"),
     ],
 )  # fmt: skip
 def test_a_wrong_option_is_refused(options, said):

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import NamedTuple
+from xml.etree.ElementTree import Element, ParseError, fromstring
 
 import numpy as np
 from jaxtyping import Float
@@ -233,25 +234,23 @@ def read_table(file: PathLike, what: str, fault: type[EchelonError]) -> TextTabl
         EchelonError: the file cannot be read, or is no table.
     """
     text = read_text(file, what, fault)
-    lines = [(k + 1, line.strip(" ")) for k, line in enumerate(re.split("\r\n|\n|\r", text))]
-    lines = [(k, line) for k, line in lines if line.strip(" \t;,|\"'")]
-    stated = re.fullmatch(r'"?sep=(.)"?', lines[0][1], re.IGNORECASE) if lines else None
+    split = enumerate(re.split("\r\n|\n|\r", text), 1)
+    lines = [(k, line.strip(" ")) for k, line in split if line.strip(" \t;,|\"'")]
+    # A spreadsheet states it in its first line.
+    stated = re.fullmatch(r'"?sep=([;,|\t])"?', lines[0][1], re.IGNORECASE) if lines else None
     lines = lines[1:] if stated else lines
     remarks = [(k, line) for k, line in lines if line.startswith(_COMMENTS)]
     body = [(k, re.split(r"\s#", line)[0]) for k, line in lines if not line.startswith(_COMMENTS)]
     if not body:
         raise fault(f"the {what} `{file}` has no line of numbers.")
     delimiter = stated[1] if stated else _delimiter([line for _, line in body[:_SAMPLE]])
-    if delimiter not in _DELIMITERS:
-        raise fault(f"the {what} `{file}` names the delimiter `{delimiter}`, and none is known.")
     try:
         rows = [_Row(k, _cells(line, delimiter)) for k, line in body[: _MOST + 2]]
         notes = [_Row(k, _cells(line.lstrip("#%/ "), delimiter)) for k, line in remarks]
     except csv.Error as error:
         raise fault(f"the {what} `{file}` is not a CSV file: {error}.") from error
     head, rows = _headed(rows)
-    width = len((head or rows[0]).cells)
-    first = rows[0].line if rows else math.inf
+    width, first = len((head or rows[0]).cells), rows[0].line if rows else math.inf
     rows = [row._replace(cells=_trimmed(row.cells, width)) for row in rows]
     notes = [note for note in notes if note.line < first and len(note.cells) == width]
     return TextTable(file, what, fault, delimiter, head, rows, notes)
@@ -283,13 +282,21 @@ def read_text(file: PathLike, what: str, fault: type[EchelonError]) -> str:
     raise fault(f"the {what} `{file}` is not a text file.")
 
 
+def read_xml(file: PathLike, what: str, fault: type[EchelonError], kind: str) -> Element:
+    """Return the root of an XML file, such as of a `kind` GPX; else raise `fault`."""
+    try:
+        return fromstring(read_text(file, what, fault))
+    except (ParseError, ValueError) as error:
+        raise fault(f"the {what} `{file}` is not {kind}: {error}.") from None
+
+
 def _delimiter(lines: list[str]) -> str:
     """Return what separates most lines into cells."""
     most = {mark: 2 * sum(mark in line for line in lines) > len(lines) for mark in _DELIMITERS}
     for mark in (";", "\t", "|"):
         if most[mark]:
             return mark
-    first, *others = ([cell for cell in line.split()] for line in lines)
+    first, *others = map(str.split, lines)
     # Of blanks and decimal commas, as `0,5 1,5`: each cell is a number.
     decimal = all(len(cells) > 1 and all(map(_NUMBER.fullmatch, cells)) for cells in others)
     decimal &= all(map(_NUMBER.fullmatch, first)) if "," in "".join(first) else bool(others)
@@ -314,10 +321,13 @@ def _headed(rows: list[_Row]) -> tuple[_Row | None, list[_Row]]:
     head = rows[0]
     if all(map(_is_value, head.cells)):
         return None, rows
-    units = [cell.strip("[]() ") for cell in rows[1].cells] if len(rows) > 1 else []
-    if len(units) != len(head.cells) or not all(_measure(unit) for unit in units):
-        return head, rows[1:]
-    if all(map(_is_value, rows[1].cells)):
+    second = rows[1].cells if len(rows) > 1 else []
+    units = [cell.strip("[]() ") for cell in second]
+    if (
+        len(units) != len(head.cells)
+        or not all(map(_measure, units))
+        or all(map(_is_value, second))
+    ):
         return head, rows[1:]
     names = [f"{name} [{unit}]" for name, unit in zip(head.cells, units, strict=True)]
     return _Row(head.line, names), rows[2:]
@@ -361,7 +371,7 @@ def _scale(table: TextTable, column: Column, k: int | None) -> tuple[float, bool
     unit = None if stated is None else stated[1]
     own = _measure(column.unit)
     seen = _measure((column.assumed or column.unit) if unit is None else unit)
-    if unit == column.unit or unit is None and own is None:
+    if unit == column.unit or not column.unit or unit is None and own is None:
         return 1.0, unit is not None
     if own is None or seen is None or seen[0] != own[0]:
         raise table.fault(

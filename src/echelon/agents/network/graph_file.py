@@ -1,7 +1,6 @@
 """Graphs in files: lists of edges, adjacency matrices, GraphML, and sparse matrices of SciPy."""
 
 import re
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -9,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from echelon.core.errors import GraphError
-from echelon.core.text_table import Column, TextTable, number_in, read_table, read_text
+from echelon.core.text_table import Column, TextTable, number_in, read_table, read_xml
 from echelon.core.types import Array, PathLike
 from echelon.core.words import amount
 
@@ -47,24 +46,22 @@ def read_graph(file: PathLike) -> "FileEdges | Array":
         return _read_sparse(file)
     if suffix == ".graphml":
         return _read_graphml(file)
-    table = read_table(file, "graph", GraphError)
-    if all(table.has(column) for column in _ENDS[:2]):
-        assert table.head is not None
-        where = [table.find(column) for column in _ENDS]
-        pick = [[row.cells[k] for k in where if k is not None] for row in table.rows]
+    table = read_table(file, "graph", GraphError).headed(_ENDS)
+    where = [k for column in _ENDS if (k := table.find(column)) is not None]
+    if all(map(table.has, _ENDS[:2])):
+        pick = [[row.cells[k] for k in where] for row in table.rows]
         return _edges_of(table, pick, [row.line for row in table.rows])
-    matrix = _matrix_of(table)
-    if matrix is not None:
+    if (matrix := _matrix_of(table)) is not None:
         return matrix
     rows = table.rows if table.head is None else [table.head, *table.rows]
     cells = [_without_dictionary(row.cells) for row in rows]
-    wrong = next((k for k, part in enumerate(cells) if len(part) not in (2, 3)), None)
-    if wrong is not None:
-        raise GraphError(
-            f"{table.place(rows[wrong].line)} has {amount(len(cells[wrong]), 'column')} and the "
-            f"file {amount(len(rows), 'line')}, {table.separated}; allowed are edges (2 or 3 "
-            "columns: from, to, weight) or a square matrix."
-        )
+    for row, part in zip(rows, cells, strict=True):
+        if len(part) not in (2, 3):
+            raise GraphError(
+                f"{table.place(row.line)} has {amount(len(part), 'column')} and the file "
+                f"{amount(len(rows), 'line')}, {table.separated}; allowed are edges (2 or 3 "
+                "columns: from, to, weight) or a square matrix."
+            )
     return _edges_of(table, cells, [row.line for row in rows])
 
 
@@ -92,7 +89,7 @@ def number_nodes(names: Sequence[str], where: str = "") -> dict[str, int]:
 
 
 def _edges_of(table: TextTable, rows: list[list[str]], lines: list[int]) -> FileEdges:
-    weights = []
+    edges = []
     for row, line in zip(rows, lines, strict=True):
         weight = number_in(row[2]) if len(row) == 3 and row[2] else 1.0
         if weight is None or not row[0] or not row[1]:
@@ -100,22 +97,17 @@ def _edges_of(table: TextTable, rows: list[list[str]], lines: list[int]) -> File
                 f"{table.place(line)} is {row}, {table.separated}, and must be an edge: from, to, "
                 "and where given its weight."
             )
-        weights.append(weight)
-    pairs = [(row[0], row[1]) for row in rows]
-    return _numbered(table.file, pairs, weights, [], None)
+        edges.append((row[0], row[1], weight))
+    return _numbered(table.file, edges, [], None)
 
 
 def _numbered(
-    file: PathLike,
-    pairs: list[tuple[str, str]],
-    weights: list[float],
-    nodes: list[str],
-    directed: bool | None,
+    file: PathLike, edges: list[tuple[str, str, float]], nodes: list[str], directed: bool | None
 ) -> FileEdges:
-    names = [*nodes, *(name for pair in pairs for name in pair)]
+    names = [*nodes, *(name for edge in edges for name in edge[:2])]
     numbers = number_nodes(names, f" of `{file}`")
-    edges = [(numbers[i], numbers[j], w) for (i, j), w in zip(pairs, weights, strict=True)]
-    return FileEdges(edges, max(numbers.values(), default=0) + 1, directed)
+    numbered = [(numbers[i], numbers[j], weight) for i, j, weight in edges]
+    return FileEdges(numbered, max(numbers.values(), default=0) + 1, directed)
 
 
 def _without_dictionary(cells: list[str]) -> list[str]:
@@ -151,25 +143,21 @@ def _read_sparse(file: PathLike) -> Array:
 
 
 def _read_graphml(file: PathLike) -> FileEdges:
-    try:
-        root = ElementTree.fromstring(read_text(file, "graph", GraphError))
-    except (ElementTree.ParseError, ValueError) as error:
-        raise GraphError(f"the graph `{file}` is not GraphML: {error}.") from None
+    root = read_xml(file, "graph", GraphError, "GraphML")
     graph = root.find("{*}graph")
     keys = [key.get("id") for key in root.iterfind("{*}key") if key.get("attr.name") == "weight"]
     nodes = [] if graph is None else [node.get("id", "") for node in graph.iterfind("{*}node")]
     if graph is None or not nodes:
         raise GraphError(f"the graph `{file}` has no `graph` with nodes.")
-    pairs, weights = [], []
+    edges = []
     for k, edge in enumerate(graph.iterfind("{*}edge"), 1):
-        pair = edge.get("source", ""), edge.get("target", "")
+        i, j = edge.get("source", ""), edge.get("target", "")
         texts = [part.text or "" for part in edge.iterfind("{*}data") if part.get("key") in keys]
         weight = number_in(texts[0].strip()) if texts else 1.0
-        if weight is None or not {*pair} <= {*nodes}:
+        if weight is None or not {i, j} <= {*nodes}:
             raise GraphError(
-                f"edge {k} of the graph `{file}` is from `{pair[0]}` to `{pair[1]}` with weight "
-                f"{texts or 1}, and must link two of its nodes by a number."
+                f"edge {k} of the graph `{file}` is from `{i}` to `{j}` with weight {texts or 1}, "
+                "and must link two of its nodes by a number."
             )
-        pairs.append(pair)
-        weights.append(weight)
-    return _numbered(file, pairs, weights, nodes, graph.get("edgedefault") == "directed")
+        edges.append((i, j, weight))
+    return _numbered(file, edges, nodes, graph.get("edgedefault") == "directed")

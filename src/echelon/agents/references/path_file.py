@@ -1,14 +1,13 @@
 """Paths in files: tables of timed points or states, in metres or in latitude and longitude, GPX."""
 
-import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float
 
 from echelon.core.errors import ReferenceError
-from echelon.core.text_table import Column, Columns, read_table, read_text, seconds_of
+from echelon.core.text_table import Column, Columns, read_table, read_xml, seconds_of
 from echelon.core.types import Array, PathLike
 
 _TIME = Column(
@@ -80,32 +79,36 @@ def read_points(
     Raises:
         ReferenceError: the file cannot be read, lacks a column, or a line is wrong.
     """
-    yaw = _YAW._replace(assumed="deg") if degrees else _YAW
-    unread = ""
-    if str(file).lower().endswith(".gpx"):
-        read, on_earth = _read_gpx(file), True
-    else:
-        table = read_table(file, "path", ReferenceError).named(columns).headed([_TIME])
-        if table.head is not None and (k := table.find(_TURNED)) is not None:
-            unread = table.head.cells[k]
-        on_earth = not table.has(_PLACE[0]) and table.has(_EARTH[0]) and table.has(_EARTH[1])
-        read = table.columns([_TIME, *(_EARTH if on_earth else _PLACE), yaw], least=2)
+    read, on_earth, turned = _read_places(file, columns, degrees)
     times, notes = _clock(file, read, begin)
-    if turned := read.absent.count("yaw") and unread:
-        notes.append(f"the path `{file}` has `{turned}`, which is not read: the yaw is 0.")
     place, angle = read.values[:, 1:4], read.values[:, 4]
+    if turned and "yaw" in read.absent:
+        notes.append(f"the path `{file}` has `{turned}`, which is not read: the yaw is 0.")
     if on_earth:
         place = _east_north_up(file, place, read.lines, "alt" not in read.absent)
     elif spatial and "z" in read.absent:
         notes.append(f"the path `{file}` has no column `z`, which is 0.")
     notes += yaw_notes(f"`{file}`", angle, degrees or "yaw" not in read.unitless)
-    turned = _unwrapped(angle)
-    for k in np.flatnonzero(np.abs(turned - angle) > 1.0)[:1]:
-        notes.append(
-            f"the yaw of `{file}:{read.lines[k]}` jumps by {angle[k] - angle[k - 1]:.3g} rad; it "
-            "is taken as wrapped to a turn, and unwrapped."
-        )
-    return PathRows(times, np.column_stack([place, turned]), tuple(notes))
+    unwrapped = _unwrapped(angle)
+    for k in np.flatnonzero(np.abs(unwrapped - angle) > 1.0)[:1]:
+        jump = f"`{file}:{read.lines[k]}` jumps by {angle[k] - angle[k - 1]:.3g} rad"
+        notes.append(f"the yaw of {jump}; it is taken as wrapped to a turn, and unwrapped.")
+    return PathRows(times, np.column_stack([place, unwrapped]), tuple(notes))
+
+
+def _read_places(
+    file: PathLike, columns: Sequence[str], degrees: bool
+) -> tuple[Columns, bool, str]:
+    """Return time, place and yaw, whether places are on the Earth, and an unread orientation."""
+    if str(file).lower().endswith(".gpx"):
+        return _read_gpx(file), True, ""
+    table = read_table(file, "path", ReferenceError).named(columns).headed([_TIME])
+    k = table.find(_TURNED)
+    turned = "" if table.head is None or k is None else table.head.cells[k]
+    on_earth = not table.has(_PLACE[0]) and table.has(_EARTH[0]) and table.has(_EARTH[1])
+    yaw = _YAW._replace(assumed="deg") if degrees else _YAW
+    wanted = [_TIME, *(_EARTH if on_earth else _PLACE), yaw]
+    return table.columns(wanted, least=2), on_earth, turned
 
 
 def read_timed(
@@ -144,28 +147,25 @@ def _clock(file: PathLike, read: Columns, begin: float | None) -> tuple[Array, l
             f"`t` of the path at `{file}:{read.lines[k + 1]}` is {times[k + 1]:.10g} s, and must "
             f"be more than the {times[k]:.10g} s of the line before."
         )
-    # Of a time since 1970 the number of digits states the unit.
-    sizes = {"s": 1.0} | ({"ms": 1e-3, "us": 1e-6, "ns": 1e-9} if "t" in read.unitless else {})
-    for unit, size in sizes.items():
-        first, lasts = times[0] * size, (times[-1] - times[0]) * size
-        if _EPOCH[0] <= first <= _EPOCH[1] and lasts <= _LASTS:
-            times, begin = (times - times[0]) * size, begin or 0.0
-            notes.append(
-                f"the times of `{file}` are taken as Unix time stamps in {unit}, and counted from "
-                "the first."
-            )
-            break
-    if begin is not None:
-        times = times - times[0] + begin
+    if (stamps := _unix(times, "t" in read.unitless)) is not None:
+        unit, times = stamps
+        notes.append(
+            f"the times of `{file}` are taken as Unix time stamps in {unit}, and counted from the "
+            "first."
+        )
+    if stamps is not None or begin is not None:
+        times = times - times[0] + (begin or 0.0)
+    return times, [*notes, *_gaps(file, times, read.lines)]
+
+
+def _gaps(file: PathLike, times: Float[Array, " K"], lines: Sequence[int]) -> Iterator[str]:
     spans = np.diff(times)
     usual, widest = np.median(spans), int(spans.argmax())
     if len(times) >= _RECORDED and spans[widest] > _GAP * usual:
-        notes.append(
-            f"the path `{file}` has a gap of {spans[widest]:.3g} s after line "
-            f"{read.lines[widest]}, where points are mostly {usual:.3g} s apart; the curve there "
-            "is a guess."
+        yield (
+            f"the path `{file}` has a gap of {spans[widest]:.3g} s after line {lines[widest]}, "
+            f"where points are mostly {usual:.3g} s apart; the curve there is a guess."
         )
-    return times, notes
 
 
 def yaw_notes(what: str, yaw: Float[Array, " K"], known: bool) -> tuple[str, ...]:
@@ -177,6 +177,17 @@ def yaw_notes(what: str, yaw: Float[Array, " K"], known: bool) -> tuple[str, ...
         f"the yaw of {what} reaches {most:.3g} rad, more than a turn; if it is in degrees, add "
         "`degrees: true`.",
     )
+
+
+def _unix(times: Float[Array, " K"], unitless: bool) -> tuple[str, Array] | None:
+    """Return the unit of Unix time stamps, and seconds since the first; None for other times."""
+    # The number of digits states the unit.
+    sizes = {"s": 1.0} | ({"ms": 1e-3, "us": 1e-6, "ns": 1e-9} if unitless else {})
+    for unit, size in sizes.items():
+        since = (times - times[0]) * size
+        if _EPOCH[0] <= times[0] * size <= _EPOCH[1] and since[-1] <= _LASTS:
+            return unit, since
+    return None
 
 
 def _unwrapped(yaw: Float[Array, " K"]) -> Float[Array, " K"]:
@@ -221,10 +232,7 @@ def _east_north_up(
 
 def _read_gpx(file: PathLike) -> Columns:
     """Return time, latitude, longitude, altitude and yaw of the points of a GPX file."""
-    try:
-        root = ElementTree.fromstring(read_text(file, "path", ReferenceError))
-    except (ElementTree.ParseError, ValueError) as error:
-        raise ReferenceError(f"the path `{file}` is not a GPX file: {error}.") from None
+    root = read_xml(file, "path", ReferenceError, "a GPX file")
     kinds = (root.findall(f".//{{*}}{kind}") for kind in ("trkpt", "rtept", "wpt"))
     points = next((found for found in kinds if found), [])
     rows = []

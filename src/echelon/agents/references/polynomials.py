@@ -124,11 +124,7 @@ class Waypoints(PolynomialPath):
         t, p = _checked_points(times, points)
         ends = ("rest" if smooth is None else "free") if ends is None else ends
         check_name("`ends` of `Waypoints` is", ends, ENDS, ReferenceError)
-        for name, number in (("smooth", smooth), ("resample", resample)):
-            if number is not None and not (is_number(number) and 0.0 < number < math.inf):
-                raise ReferenceError(
-                    f"`{name}` of `Waypoints` is {number}, and must be a positive number."
-                )
+        _check_positive(smooth=smooth, resample=resample)
         rows = np.column_stack([p, _yaws(yaw, degrees, t)])
         self.ends = ends
         self.notes = yaw_notes("`Waypoints`", rows[:, 3], degrees)
@@ -210,6 +206,14 @@ def _checked_points(
             f"`points` of `Waypoints` {got}, and must be {len(t)} finite points (x, y, z)."
         )
     return t, p
+
+
+def _check_positive(**options: float | None) -> None:
+    for name, number in options.items():
+        if number is not None and not (is_number(number) and 0.0 < number < math.inf):
+            raise ReferenceError(
+                f"`{name}` of `Waypoints` is {number}, and must be a positive number."
+            )
 
 
 def _yaws(yaw: float | Sequence[float] | Array, degrees: bool, times: Array) -> Float[Array, " K"]:

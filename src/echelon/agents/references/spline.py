@@ -17,7 +17,7 @@ _FEWEST = 4
 _DENSER = 1.3
 
 
-class Pieces(NamedTuple):
+class SplinePieces(NamedTuple):
     """A spline as polynomials between its knots.
 
     Attributes:
@@ -38,7 +38,7 @@ def resampled(
     return even, np.stack([np.interp(even, times, column) for column in points.T], axis=1)
 
 
-def through(times: Float[Array, " K"], points: Float[Array, "K 4"], ends: str) -> Pieces:
+def through(times: Float[Array, " K"], points: Float[Array, "K 4"], ends: str) -> SplinePieces:
     """Return the spline through points; its first six derivatives are continuous."""
     # Imported here: splines load slowly, and only this reference needs them.
     from scipy.interpolate import make_interp_spline
@@ -55,7 +55,7 @@ def through(times: Float[Array, " K"], points: Float[Array, "K 4"], ends: str) -
 
 def near(
     times: Float[Array, " K"], points: Float[Array, "K 4"], ends: str, tolerance: float
-) -> Pieces:
+) -> SplinePieces:
     """Return a spline with few pieces that stays within a tolerance (m, and rad) of all points.
 
     Each number of pieces has its least squares, and the first one within the tolerance is taken.
@@ -66,7 +66,7 @@ def near(
     from scipy.interpolate import BSpline
 
     scale = (times[-1] - times[0]) / (len(times) - 1)
-    at, count, away = (times - times[0]) / scale, 1, math.inf
+    at, count = (times - times[0]) / scale, 1
     tied = 6 if ends == "rest" else 0
     while count + 7 - tied <= len(times) // 2:
         knots = at[np.linspace(0, len(at) - 1, count + 1).round().astype(int)]
@@ -76,12 +76,11 @@ def near(
         if away <= tolerance:
             return _pieces(fit, times[0] + scale * knots, scale, points)
         count = math.ceil(_DENSER * count + 0.5)
-    if not math.isfinite(away):
-        fewest = 2 * (8 - tied)
-        raise ReferenceError(f"`smooth` needs {fewest} or more points, and there are {len(at)}.")
+    what = "no smooth curve stays within it of all points"
+    if count == 1:
+        what = f"it needs {2 * (8 - tied)} or more points, and there are {len(at)}"
     raise ReferenceError(
-        f"`smooth` is {tolerance:g} m, and no smooth curve stays within it of all points (the last "
-        f"one tried is {away:.3g} m away); give a larger one, or leave it out."
+        f"`smooth` is {tolerance:g} m, and {what}; give a larger one, or leave it out."
     )
 
 
@@ -103,7 +102,7 @@ def _least_squares(
     return whole, ties @ np.reshape(solved, (-1, points.shape[1]))
 
 
-def _pieces(spline: Any, times: Array, scale: float, points: Array) -> Pieces:
+def _pieces(spline: Any, times: Array, scale: float, points: Array) -> SplinePieces:
     """Return a spline over the time in units of `scale` since the first, as pieces in seconds."""
     # Taylor's coefficients at each knot, which JAX evaluates without SciPy.
     at = ((times - times[0]) / scale)[:-1]
@@ -115,4 +114,4 @@ def _pieces(spline: Any, times: Array, scale: float, points: Array) -> Pieces:
     constant = (points == points[0]).all(axis=0)
     coefficients[:-1, :, constant] = 0.0
     coefficients[-1, :, constant] = points[0, constant][:, None]
-    return Pieces(times, coefficients)
+    return SplinePieces(times, coefficients)
