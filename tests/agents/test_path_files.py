@@ -110,14 +110,17 @@ def test_pieces_that_do_not_meet_smoothly_fly_without_a_proof():
 
 GOOD = "t,x,y,z,yaw\n0,0,0,1,0\n1,1,0,1,0\n"
 FAULTS = [
-    ("t,x,y,yaw\n0,0,0,0\n", ":1` lacks `z`"),
-    ("t,x,y,z,w\n0,0,0,0,0\n", ":1` has `w`"),
+    ("t,x,z,yaw\n0,0,0,0\n", ":1` lacks `y`: it names `t`, `x`, `z`, `yaw`, separated by commas"),
+    ("t,x,x,y\n0,0,0,0\n1,0,0,0\n", ":1` has `x`, `x` for `x`, and must have one column"),
     (GOOD + "2,a lot,0,1,0\n", "`x` of the path at `{}:4` is `a lot`"),
     (GOOD + "\n2,0,0,nan,0\n", "`z` of the path at `{}:5` is `nan`"),
-    (GOOD + "2,0,0\n", ":4` has 3 numbers, and must have 5."),
+    (GOOD + "2,0,0\n", ":4` has 3 numbers, separated by commas, and must have 5."),
     (GOOD + "1,0,0,1,0\n", "`t` of the path at `{}:4` is 1 s, and must be more"),
-    ("", "`{}:1` lacks `t`, `x`, `y`, `z`"),
-    ("t;x;y;z\n0;0;0;1\n", "once (`yaw` may be left out), separated by commas."),
+    ("", "the path `{}` has no line of numbers."),
+    (
+        "a;b\n0;0\n",
+        "`a`, `b`, separated by semicolons; needed are `t`, `x`, `y` (`z`, `yaw` may be",
+    ),
     ("t,x,y,z\n0,0,0,1\n", "must have from 2 to 100000 lines of numbers, and has 1."),
     ("t,x\0", "path"),
     ("t,x,y,z\n" + "0,0,0,1\n" * 100_001, "and has more than 100000."),
@@ -139,7 +142,7 @@ def test_a_wrong_line_is_named(tmp_path, text, said):
     ("rows", "said"),
     [
         (["0," + "0," * 31 + "0"], ":2` lasts 0 s, and must last a positive time"),
-        (["1,1," + "0," * 30 + "0", "1," * 32 + "1"], ":3` begins 1 m and 1 rad from the end"),
+        (["1,1," + "0," * 30 + "0", "1," * 32 + "1"], ":3` begins 1.41 m and 1 rad from the end"),
     ],
 )
 def test_a_wrong_piece_is_named(tmp_path, rows, said):
@@ -175,7 +178,7 @@ def test_a_scenario_flies_the_points_of_its_file(tmp_path):
     radians = SCENARIO["reference"] | {"degrees": False}
     parts, settings = ech.build(ech.load_scenario(written(tmp_path, reference=radians)))
     [remark, *_] = parts.drive.warnings(parts.model, parts.graph, settings)
-    assert "the yaw of `Waypoints` reaches 90 rad, more than a turn" in remark
+    assert "path.csv` reaches 90 rad, more than a turn" in remark
 
 
 def test_a_run_folder_contains_the_file_of_its_path(tmp_path, echelon):

@@ -1,5 +1,8 @@
 """The closed loop as a linear system, and linear agents from MATLAB's files."""
 
+import sys
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -72,7 +75,7 @@ def test_the_system_is_written_with_its_names(tmp_path):
     parts = led_by(ech.models.DoubleIntegrator(2), ech.references.Circle())
     system = ech.state_space(parts, tmp_path / "loop.mat")
     content = loadmat(tmp_path / "loop.mat")
-    for name, matrix in system._asdict().items():
+    for name, matrix in zip("ABCD", system, strict=True):
         assert (content[name] == matrix).all()
     first = [content[name][0, 0][0] for name in ("states", "inputs", "outputs")]
     assert first == ["x_0", "path_x", "error_x_0"]
@@ -148,3 +151,39 @@ def test_a_wrong_file_is_refused_in_one_sentence(tmp_path):
         with pytest.raises(ech.errors.ModelError) as error:
             ech.models.Linear.read(file)
         assert said in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_state_space_of_scipy_is_the_model_in_both_kinds_of_time():
+    A, B = OSCILLATOR
+    system = scipy.signal.StateSpace(A, B, np.eye(2), np.zeros((2, 1)))
+    for given in (system, system.to_discrete(0.1)):
+        model = ech.models.Linear.from_control(given, ["angle", "rate"])
+        assert model.A == pytest.approx(A, abs=1e-9) and model.B == pytest.approx(B, abs=1e-9)
+        assert model.state_names == ("angle", "rate")
+    # As python-control says that a step is not specified.
+    unknown = SimpleNamespace(A=A, B=B, C=np.eye(2), D=np.zeros((2, 1)), dt=True)
+    direct = scipy.signal.StateSpace(A, B, np.eye(2), np.ones((2, 1)))
+    for given, said in (
+        (unknown, "`Ts` of the state space is -1.0, and must be one step"),
+        (direct, "`D` of the state space is not zero"),
+        (scipy.signal.TransferFunction([1.0], [1.0, 1.0]), "and must be a `StateSpace` with A, B"),
+    ):
+        with pytest.raises(ech.errors.ModelError, match=said):
+            ech.models.Linear.from_control(given)
+
+
+def test_python_control_receives_the_matrices_and_their_names(monkeypatch):
+    system = ech.state_space(led_by(ech.models.DoubleIntegrator(2), ech.references.Circle()))
+    monkeypatch.setitem(sys.modules, "control", None)
+    with pytest.raises(ech.errors.MissingExtraError, match="install '.\\[control\\]'") as error:
+        system.to_control()
+    assert error.value.exit_code == 4
+    taken = SimpleNamespace(StateSpace=lambda *matrices, **names: (matrices, names))
+    monkeypatch.setitem(sys.modules, "control", taken)
+    matrices, names = system.to_control()
+    assert [*matrices] == [*system] and names.pop("remove_useless_states") is False
+    assert {key: len(value) for key, value in names.items()} == {
+        "states": len(matrices[0]),
+        "inputs": matrices[1].shape[1],
+        "outputs": len(matrices[2]),
+    }

@@ -627,3 +627,11 @@ def test_a_cluster_that_does_not_answer_is_one_sentence():
     plan = Sweep(ech.load_scenario("van-der-pol", SHORT), axes_of({"seed": [1]}))
     with pytest.raises(ech.errors.OutputError, match="^the cluster at `nowhere:1` does not answer"):
         compute(plan, print, cluster="nowhere:1")
+
+
+def test_numbers_of_numpy_are_numbers():
+    over = {"seed": np.arange(2), "follower.gain.coupling": np.linspace(3.0, 5.0, 3)}
+    assert axes_of(over) == axes_of({"seed": [0, 1], "follower.gain.coupling": [3.0, 4.0, 5.0]})
+    assert axes_of({"seed": [np.int32(4), np.uint8(5)]})[0].text == "seed=4, 5"
+    vectors = {"graph.leaders": [np.array([0]), (np.int64(0), 1)], "model.x": [np.float32(0.5)]}
+    assert [axis.values for axis in axes_of(vectors)] == [([0], [0, 1]), (0.5,)]

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
-from echelon.agents.references.flatness import reference_warnings
+from echelon.agents.references.flatness import reference_warnings, stop_warnings
 from echelon.agents.references.reference import LeaderPath, Reference
 from echelon.core.cache import memoize
 from echelon.core.errors import LawError
@@ -47,8 +47,10 @@ def leader_warnings(
     reference = reference_of(law)
     # A flat reference is an exact motion, which only limits can make infeasible.
     exact = isinstance(reference, Reference) and not (limits and model.input_limits)
-    if reference is None or exact:
-        return () if reference is None else reference.remarks()
+    if reference is None:
+        return ()
+    if exact:
+        return (*reference.remarks(), *stop_warnings(model, reference, horizon))
     return reference_warnings(model, reference, horizon, limits)
 
 

@@ -16,6 +16,7 @@ from echelon.agents.references.flatness import (
     first_state,
     follow_at,
     followed_states,
+    moving,
     without_heading,
 )
 from echelon.agents.references.reference import LeaderPath, check_kind_of, check_reference
@@ -138,6 +139,7 @@ class Tracking(PathLeader):
         begin, still = follow_at(model, self.reference, start), ""
         if without_heading(model, self.reference, start).any():
             still = "its speed is 0 at t = 0 s, and the model has no heading at rest"
+            still += moving(model, self.reference, start)
         if still or not all(np.isfinite(part).all() for part in begin):
             raise ReferenceError(
                 f"the reference `{type(self.reference).__name__}` cannot be followed by "

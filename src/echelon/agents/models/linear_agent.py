@@ -268,6 +268,30 @@ class Linear(ControlAffine):
         return cls(*_continuous(sampled.A, sampled.B, float(step)), C, names)
 
     @classmethod
+    def from_control(cls, system: Any, names: Sequence[str] = ()) -> "Linear":
+        """Return the model of a `StateSpace` of python-control or SciPy.
+
+        One in discrete time, with a step `dt` (s), is converted as by `discrete`.
+
+        Args:
+            system: what has the matrices A, B, C, D and, in discrete time, `dt`.
+            names: n state names; x1, x2, ... when left out.
+
+        Raises:
+            ModelError: it is no state space, D is not zero, or its step is not specified.
+        """
+        if not all(hasattr(system, name) for name in "ABCD"):
+            raise ModelError(
+                f"`system` is a `{type(system).__name__}`, and must be a `StateSpace` with A, B, C "
+                "and D; convert a transfer function first, as by `control.ss`."
+            )
+        # python-control says True for a step that is not specified, and 0 or None for no steps.
+        step = getattr(system, "dt", None)
+        found = {name: np.asarray(getattr(system, name)) for name in "ABCD"}
+        found["Ts"] = np.asarray(-1.0 if step is True else step or 0.0)
+        return cls._of("the state space", found, names)
+
+    @classmethod
     def read(cls, file: PathLike, names: Sequence[str] = ()) -> "Linear":
         """Return the model in a MATLAB file: A and B, and where given C, D and the step Ts.
 
@@ -276,10 +300,14 @@ class Linear(ControlAffine):
         Raises:
             ModelError: the file cannot be read, lacks A or B, D is not zero, or Ts is no step.
         """
-        found = read_matrices(file)
+        return cls._of(f"`{file}`", read_matrices(file), names)
+
+    @classmethod
+    def _of(cls, what: str, found: Mapping[str, Array], names: Sequence[str]) -> "Linear":
+        """Return the model of matrices by name, in steps where `Ts` is not zero."""
         if found.get("D", np.zeros(1)).any():
             raise ModelError(
-                f"`D` of `{file}` is not zero, and the output of an agent depends on its state "
+                f"`D` of {what} is not zero, and the output of an agent depends on its state "
                 "only; leave `D` out, or add the input's filter to the states."
             )
         matrices, C, Ts = (found["A"], found["B"]), found.get("C"), found.get("Ts", np.zeros(1))
@@ -288,7 +316,7 @@ class Linear(ControlAffine):
         # MATLAB has -1 for a discrete-time model whose step is not specified.
         if Ts.size != 1 or not Ts.item() > 0.0:
             raise ModelError(
-                f"`Ts` of `{file}` is {' '.join(map(str, Ts.ravel()[:3]))}, and must be one step "
+                f"`Ts` of {what} is {' '.join(map(str, Ts.ravel()[:3]))}, and must be one step "
                 "in s, or 0 of a model in continuous time."
             )
         return cls.discrete(*matrices, Ts.item(), C, names)

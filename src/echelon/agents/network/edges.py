@@ -177,12 +177,17 @@ def _square(matrix: ArrayLike) -> Array:
             "the adjacency matrix must be a square matrix of numbers (agents, agents), with rows "
             "of one length."
         ) from None
-    if weights.ndim != 2 or len(weights) != len(weights.T):
+    return weights
+
+
+def _checked_square(weights: Any) -> Any:
+    """Return a matrix, dense or sparse, after checking that it is square and finite."""
+    if weights.ndim != 2 or weights.shape[0] != weights.shape[1]:
         raise GraphError(
-            f"the adjacency matrix has shape {np.shape(weights)}, and must be a square matrix of "
+            f"the adjacency matrix has shape {weights.shape}, and must be a square matrix of "
             "numbers (agents, agents)."
         )
-    if not np.isfinite(weights).all():
+    if not np.isfinite(weights.data if hasattr(weights, "tocoo") else weights).all():
         raise GraphError("the adjacency matrix has entries that are NaN or infinite.")
     return weights
 
@@ -191,17 +196,24 @@ def edges_of_matrix(
     matrix: ArrayLike, leaders: Iterable[int], directed: bool | None
 ) -> tuple[list[list[float]], Iterable[int], int, bool]:
     """Return edges, leaders, agents and whether directed, of an adjacency; else `GraphError`."""
-    weights = _square(matrix)
-    symmetric = bool((weights == weights.T).all())
+    # Imported here: few graphs are matrices.
+    from scipy.sparse import csr_array, triu
+
+    weights = csr_array(matrix, dtype=np.float64) if hasattr(matrix, "tocoo") else _square(matrix)
+    weights = csr_array(_checked_square(weights))
+    weights.sum_duplicates()
+    weights.eliminate_zeros()
+    symmetric = (weights != weights.T).nnz == 0
     if directed is False and not symmetric:
         raise GraphError(
             "the adjacency matrix is not symmetric, and that of an undirected graph must be."
         )
     one_way = not symmetric if directed is None else directed
     # Row i receives from column j, and a directed edge leads from the sender to the receiver.
-    receivers, senders = np.nonzero(weights if one_way else np.triu(weights))
-    edges = np.column_stack([senders, receivers, weights[receivers, senders]])
-    return edges.tolist(), leaders, len(weights), one_way
+    chosen: Any = weights.tocoo() if one_way else triu(weights, format="coo")
+    receivers, senders = chosen.coords
+    edges = np.column_stack([senders, receivers, chosen.data])
+    return edges.tolist(), leaders, chosen.shape[0], one_way
 
 
 # ---- links between points closer than a radius ---------------------------------------------------

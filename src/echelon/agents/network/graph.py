@@ -24,6 +24,7 @@ from echelon.agents.network.edges import (
     split_weights,
 )
 from echelon.agents.network.events import Event, check_backups, event_faults, schedule_of
+from echelon.agents.network.graph_file import FileEdges, number_nodes, read_graph
 from echelon.agents.network.matrices import (
     GraphMatrices,
     check_reached,
@@ -41,7 +42,7 @@ from echelon.agents.network.spectrum import (
 )
 from echelon.agents.network.switching import Schedule, Stretch, unite
 from echelon.core.errors import GraphError
-from echelon.core.types import Array
+from echelon.core.types import Array, PathLike
 from echelon.core.words import amount
 
 if TYPE_CHECKING:
@@ -162,24 +163,57 @@ class Graph(GraphMatrices):
 
     @classmethod
     def from_networkx(cls, graph: "nx.Graph[Any]", leaders: Iterable[int] = (0,)) -> "Graph":
-        """Return the graph of a networkx graph whose nodes are 0 .. N-1, directed where it is.
+        """Return the graph of a networkx graph, directed where it is.
 
-        The edge attribute `weight` is read, and is 1 where it is missing.
+        Its nodes are 0 .. N-1, or texts, which are numbered as in `read`. The edge attribute
+        `weight` is read, and is 1 where it is missing.
 
         Raises:
-            GraphError: it is no graph of networkx, or its nodes are not 0 .. N-1.
+            GraphError: it is no graph of networkx, or its nodes are neither 0 .. N-1 nor texts.
         """
         if not (hasattr(graph, "nodes") and hasattr(graph, "is_directed")):
             raise GraphError(
                 f"`graph` is a `{type(graph).__name__}`, and must be a graph of networkx."
             )
-        if set(graph.nodes) != set(range(len(graph))):
+        text = all(isinstance(node, str) for node in graph.nodes)
+        number = number_nodes(list(graph.nodes)) if text else {node: node for node in graph.nodes}
+        if set(number.values()) != set(range(len(graph))):
             raise GraphError(
                 "the nodes of the networkx graph must be the whole numbers from 0 on, without "
-                "a gap."
+                "a gap, or texts."
             )
-        edges = [(i, j, data.get("weight", 1.0)) for i, j, data in graph.edges(data=True)]
+        weighted = graph.edges(data="weight", default=1.0)
+        edges = [(number[i], number[j], weight) for i, j, weight in weighted]
         return cls(edges, leaders, len(graph), graph.is_directed())
+
+    @classmethod
+    def read(
+        cls, file: PathLike, leaders: Iterable[int] = (0,), directed: bool | None = None
+    ) -> "Graph":
+        """Return the graph in a file.
+
+        The file is a table of edges (from, to and where given a weight), a table that is an
+        adjacency matrix as of `from_adjacency`, GraphML (`.graphml`), or a sparse matrix that
+        `scipy.sparse.save_npz` wrote (`.npz`). Whole numbers name agents; nodes such as `n0`, `n1`
+        are agents in the order of their numbers, other texts in the order in which they occur.
+
+        Args:
+            file: path of the file.
+            leaders: numbers of the leaders.
+            directed: whether edges carry information one way; by default as GraphML says, if a
+                matrix is not symmetric, and not for a list of edges.
+
+        Raises:
+            GraphError: the file cannot be read, or has no graph; the message names file and line.
+        """
+        found = read_graph(file)
+        try:
+            if not isinstance(found, FileEdges):
+                return cls.from_adjacency(found, leaders, directed)
+            one_way = bool(found.directed if directed is None else directed)
+            return cls(found.edges, leaders, found.agents, one_way)
+        except GraphError as error:
+            raise GraphError(f"of the graph `{file}`: {error}") from None
 
     @classmethod
     def from_adjacency(
@@ -188,7 +222,8 @@ class Graph(GraphMatrices):
         """Return the graph of an adjacency matrix.
 
         Args:
-            matrix: (N, N), A_ij >= 0 is the weight with which i receives from j; 0 for no edge.
+            matrix: (N, N), A_ij >= 0 is the weight with which i receives from j; 0 for no edge. It
+                may be a sparse matrix of SciPy.
             leaders: numbers of the leaders.
             directed: whether edges carry information one way; by default if A is not symmetric.
 

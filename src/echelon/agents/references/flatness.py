@@ -188,25 +188,47 @@ def reference_warnings(
     """Return one sentence with its numbers for each fault of a reference that leads a model."""
     required, model_name = reference_demand(model, reference, horizon), type(model).__name__
     name, warnings = type(reference).__name__, [*reference.remarks()]
-    times = np.linspace(0.0, horizon, _SAMPLES)
-    still = without_heading(model, reference, times)
-    if still.any():
-        return (
-            *warnings,
-            f"the reference `{name}` cannot be followed by `{model_name}` at t = "
-            f"{times[still][0]:.4g} s: its speed is 0 there, and the model has no heading at rest.",
-        )
+    if stops := stop_warnings(model, reference, horizon):
+        return (*warnings, *stops)
     if limits and required.share > 1.0:
-        why = reference.special_at(required.at)
         warnings.append(
             f"the reference `{name}` is too fast for `{model_name}`: {too_fast(model, required)}"
-            f"{why and '; '}{why}."
+            f"{_forced(model, reference, horizon, required.share)}."
         )
     if not required.feasible:
         warnings.append(
             f"the reference `{name}` is no motion of `{model_name}`: {infeasible(model, required)}."
         )
     return (*warnings, *_turned_over(model, reference, horizon))
+
+
+def stop_warnings(model: ControlAffine, reference: LeaderPath, horizon: float) -> tuple[str, ...]:
+    """Return when a path stops, of a model that has no heading at rest, a sentence."""
+    times = np.linspace(0.0, horizon, _SAMPLES)
+    still = times[without_heading(model, reference, times)][:1]
+    return tuple(
+        f"the reference `{type(reference).__name__}` cannot be followed by "
+        f"`{type(model).__name__}` at t = {t:.4g} s: its speed is 0 there, and the model has no "
+        f"heading at rest{moving(model, reference, still)}."
+        for t in still
+    )
+
+
+def _forced(model: ControlAffine, reference: LeaderPath, horizon: float, share: float) -> str:
+    """Return a clause on what forces a demand: without it, which is tried, it is half or less."""
+    for why, key, path in reference.variants():
+        other = reference_demand(model, path, horizon).share
+        if other <= 0.5 * share:
+            return f"; the path {why}, and with `{key}` it needs {other:.3g} times the range"
+    return ""
+
+
+def moving(model: ControlAffine, reference: LeaderPath, times: Float[Array, " T"]) -> str:
+    """Return a clause on what stops a path at times, where it is known; see `without_heading`."""
+    for why, key, path in reference.variants():
+        if not without_heading(model, path, times).any():
+            return f"; the path {why}, and moves then with `{key}`"
+    return ""
 
 
 def without_heading(

@@ -1,136 +1,253 @@
-"""CSV files of paths: a line of column names, then lines of numbers."""
+"""Paths in files: tables of timed points or states, in metres or in latitude and longitude, GPX."""
 
-import csv
-import itertools
-import math
 from collections.abc import Iterator, Sequence
-from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float
 
-from echelon.core.errors import ReferenceError, listing
+from echelon.core.errors import ReferenceError
+from echelon.core.text_table import Column, Columns, read_table, read_xml, seconds_of
 from echelon.core.types import Array, PathLike
-from echelon.core.words import amount
 
-_MOST = 100_000
-"""Rows; a path of an hour with 25 points per second has fewer."""
+_TIME = Column(
+    "t", "s", ("time", "timestamp", "elapsed", "time_stamp", "stamp", "sec", "secs", "seconds")
+)
+_OTHERS = (
+    *(
+        "pos{}",
+        "pos_{}",
+        "position_{}",
+        "pose_position_{}",
+        "field_pose_pose_position_{}",
+        "p_{}",
+        "p{}",
+    ),
+    *("{}_pos", "{}_position", "stateestimate_{}", "p_rs_r_{}", "t{}"),
+)
+_PLACE = [
+    Column(axis, "m", tuple(other.format(axis) for other in _OTHERS), optional=axis == "z")
+    for axis in "xyz"
+]
+_TURNED = Column("qw", "", ("q_w", "orientation_w", "pose_orientation_w", "q_rs_w", "heading"))
+"""What states an orientation that is not read."""
+_YAW = Column("yaw", "rad", ("yaw_angle", "psi", "theta"), optional=True)
+_EARTH = [
+    Column("lat", "rad", ("latitude", "gps_lat"), "deg"),
+    Column("lon", "rad", ("long", "lng", "longitude", "gps_lon"), "deg"),
+    Column("alt", "m", ("altitude", "ele", "elevation", "height", "gps_alt"), optional=True),
+]
+_EPOCH, _LASTS = (9e8, 4.1e9), 1e6
+"""s; Unix time stamps of 1998 to 2099, and what a path with such lasts at most."""
+_RECORDED, _GAP = 20, 5.0
+"""From so many points on a path is a recording, with a gap where a step is so much longer."""
 
 
-class Columns(NamedTuple):
-    """The numbers of a file.
+class PathRows(NamedTuple):
+    """The rows of a path in a file.
 
     Attributes:
-        values: one row per line and one column per requested name; an absent column is zero.
-        lines: the number of each row's line in the file, from 1.
+        times: (K,) increasing, s.
+        values: (K, c) the other columns.
+        notes: what was seen that is probably not meant, a sentence each.
     """
 
+    times: Float[Array, " K"]
     values: Float[Array, "K c"]
-    lines: Sequence[int]
+    notes: tuple[str, ...]
 
 
-def read_columns(file: PathLike, names: Sequence[str], optional: Sequence[str] = ()) -> Columns:
-    """Return the named columns of a CSV file, in the order of the names.
+def read_points(
+    file: PathLike,
+    degrees: bool = False,
+    columns: Sequence[str] = (),
+    begin: float | None = None,
+    spatial: bool = False,
+) -> PathRows:
+    """Return times and points (x, y, z, yaw) of a table, or of a GPX file; s, m and rad.
 
-    The file's first line names its columns, in any order. Times in a column `t` increase.
+    Latitude, longitude and altitude become metres east, north and up of the first point. Yaw that
+    is wrapped to one turn is unwrapped.
 
     Args:
         file: path of the file.
-        names: names of all columns.
-        optional: those of them that the file may lack.
+        degrees: whether a yaw without a unit is in degrees.
+        columns: names of the columns, instead of the file's.
+        begin: time of the first point, s; by default the file's, and 0 for Unix time stamps.
+        spatial: whether a missing `z` is remarked.
 
     Raises:
-        ReferenceError: the file cannot be read, lacks a column, has another one, or a line does not
-            consist of finite numbers.
+        ReferenceError: the file cannot be read, lacks a column, or a line is wrong.
     """
-    try:
-        # The byte order mark that spreadsheets write does not belong to the first name.
-        with Path(file).open(encoding="utf-8-sig", newline="") as stream:
-            reader = csv.reader(stream)
-            rows = ((reader.line_num, cells) for cells in reader if "".join(cells).strip())
-            return _columns(file, rows, names, optional)
-    except OSError as error:
-        raise ReferenceError(
-            f"the path `{file}` cannot be read: {error.strerror or error}."
-        ) from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ReferenceError(f"the path `{file}` is not a CSV file: {error}.") from error
+    read, on_earth, turned = _read_places(file, columns, degrees)
+    times, notes = _clock(file, read, begin)
+    place, angle = read.values[:, 1:4], read.values[:, 4]
+    if turned and "yaw" in read.absent:
+        notes.append(f"the path `{file}` has `{turned}`, which is not read: the yaw is 0.")
+    if on_earth:
+        place = _east_north_up(file, place, read.lines, "alt" not in read.absent)
+    elif spatial and "z" in read.absent:
+        notes.append(f"the path `{file}` has no column `z`, which is 0.")
+    notes += yaw_notes(f"`{file}`", angle, degrees or "yaw" not in read.unitless)
+    unwrapped = _unwrapped(angle)
+    for k in np.flatnonzero(np.abs(unwrapped - angle) > 1.0)[:1]:
+        jump = f"`{file}:{read.lines[k]}` jumps by {angle[k] - angle[k - 1]:.3g} rad"
+        notes.append(f"the yaw of {jump}; it is taken as wrapped to a turn, and unwrapped.")
+    return PathRows(times, np.column_stack([place, unwrapped]), tuple(notes))
 
 
-def _columns(
+def _read_places(
+    file: PathLike, columns: Sequence[str], degrees: bool
+) -> tuple[Columns, bool, str]:
+    """Return time, place and yaw, whether places are on the Earth, and an unread orientation."""
+    if str(file).lower().endswith(".gpx"):
+        return _read_gpx(file), True, ""
+    table = read_table(file, "path", ReferenceError).named(columns).headed([_TIME])
+    k = table.find(_TURNED)
+    turned = "" if table.head is None or k is None else table.head.cells[k]
+    on_earth = not table.has(_PLACE[0]) and table.has(_EARTH[0]) and table.has(_EARTH[1])
+    yaw = _YAW._replace(assumed="deg") if degrees else _YAW
+    wanted = [_TIME, *(_EARTH if on_earth else _PLACE), yaw]
+    return table.columns(wanted, least=2), on_earth, turned
+
+
+def read_timed(
     file: PathLike,
-    rows: Iterator[tuple[int, list[str]]],
-    names: Sequence[str],
-    optional: Sequence[str],
-) -> Columns:
-    line, head = next(rows, (1, []))
-    head = _head(f"`{file}:{line}`", head, names, optional)
-    numbers, lines = [], []
-    for line, cells in itertools.islice(rows, _MOST + 1):
-        numbers.append(_row(f"`{file}:{line}`", head, cells))
-        lines.append(line)
-    if not 2 - ("t" not in names) <= len(numbers) <= _MOST:
-        count = f"more than {_MOST}" if len(numbers) > _MOST else str(len(numbers))
-        raise ReferenceError(
-            f"the path `{file}` must have from {2 - ('t' not in names)} to {_MOST} lines of "
-            f"numbers, and has {count}."
-        )
-    table = np.array(numbers)
-    absent = np.zeros(len(table))
-    values = [table[:, head.index(name)] if name in head else absent for name in names]
-    if "t" in names:
-        _check_times(file, values[names.index("t")], lines)
-    return Columns(np.stack(values, axis=1), lines)
+    wanted: Sequence[Column],
+    columns: Sequence[str] = (),
+    begin: float | None = None,
+) -> PathRows:
+    """Return times and the wanted columns of a table; the rest as of `read_points`.
+
+    Raises:
+        ReferenceError: the file cannot be read, lacks a column, or a line is wrong.
+    """
+    table = read_table(file, "path", ReferenceError).named(columns)
+    time = _TIME._replace(others=()) if any(c.name in _TIME.others for c in wanted) else _TIME
+    read = table.columns([time, *wanted], least=2)
+    times, notes = _clock(file, read, begin)
+    return PathRows(times, read.values[:, 1:], tuple(notes))
 
 
-def _head(place: str, cells: list[str], names: Sequence[str], optional: Sequence[str]) -> list[str]:
-    # NumPy writes its header as a comment, and other programs end lines with a comma.
-    head = [cell.strip() for cell in ",".join(cells).lstrip("# ").rstrip(", ").split(",")]
-    known = {name.lower(): name for name in names}
-    head = [known.get(name.lower(), name) for name in head]
-    missing = [name for name in names if name not in (*head, *optional)]
-    surplus = [name for name in head if name not in names or head.count(name) > 1]
-    if missing or surplus:
-        which = f"lacks {listing(missing)}" if missing else f"has {listing(dict.fromkeys(surplus))}"
-        free = f" ({listing(optional)} may be left out)" if optional else ""
-        raise ReferenceError(
-            f"the first line of the path at {place} {which}, and must name each of the columns "
-            f"{listing(names)} once{free}, separated by commas."
-        )
-    return head
+_Path = TypeVar("_Path")
 
 
-def _row(place: str, head: Sequence[str], cells: Sequence[str]) -> list[float]:
-    cells = cells[:-1] if len(cells) == len(head) + 1 and not cells[-1].strip() else cells
-    if len(cells) != len(head):
-        raise ReferenceError(
-            f"the line of the path at {place} has {amount(len(cells), 'number')}, and must have "
-            f"{len(head)}."
-        )
-    try:
-        numbers = list(map(float, cells))
-    except ValueError:
-        numbers = [math.nan]
-    if not all(map(math.isfinite, numbers)):
-        name, cell = next(pair for pair in zip(head, cells, strict=True) if not _finite(pair[1]))
-        raise ReferenceError(
-            f"`{name}` of the path at {place} is `{cell.strip()[:40]}`, and must be a finite "
-            "number."
-        )
-    return numbers
+def noted(path: _Path, notes: tuple[str, ...]) -> _Path:
+    """Return a path that was just made, whose field `notes` is that of its file."""
+    # No argument of its class: a scenario would offer it.
+    object.__setattr__(path, "notes", notes)
+    return path
 
 
-def _finite(cell: str) -> bool:
-    try:
-        return math.isfinite(float(cell))
-    except ValueError:
-        return False
-
-
-def _check_times(file: PathLike, times: Array, lines: Sequence[int]) -> None:
+def _clock(file: PathLike, read: Columns, begin: float | None) -> tuple[Array, list[str]]:
+    """Return the times of a run, and what is remarkable about the file's."""
+    times, notes = read.values[:, 0], list[str]()
     for k in np.flatnonzero(np.diff(times) <= 0.0)[:1]:
         raise ReferenceError(
-            f"`t` of the path at `{file}:{lines[k + 1]}` is {times[k + 1]:g} s, and must be more "
-            f"than the {times[k]:g} s of the line before."
+            f"`t` of the path at `{file}:{read.lines[k + 1]}` is {times[k + 1]:.10g} s, and must "
+            f"be more than the {times[k]:.10g} s of the line before."
         )
+    if (stamps := _unix(times, "t" in read.unitless)) is not None:
+        unit, times = stamps
+        notes.append(
+            f"the times of `{file}` are taken as Unix time stamps in {unit}, and counted from the "
+            "first."
+        )
+    if stamps is not None or begin is not None:
+        times = times - times[0] + (begin or 0.0)
+    return times, [*notes, *_gaps(file, times, read.lines)]
+
+
+def _gaps(file: PathLike, times: Float[Array, " K"], lines: Sequence[int]) -> Iterator[str]:
+    spans = np.diff(times)
+    usual, widest = np.median(spans), int(spans.argmax())
+    if len(times) >= _RECORDED and spans[widest] > _GAP * usual:
+        yield (
+            f"the path `{file}` has a gap of {spans[widest]:.3g} s after line {lines[widest]}, "
+            f"where points are mostly {usual:.3g} s apart; the curve there is a guess."
+        )
+
+
+def yaw_notes(what: str, yaw: Float[Array, " K"], known: bool) -> tuple[str, ...]:
+    """Return that angles are probably in degrees, unless their unit is known."""
+    most = float(np.abs(yaw).max())
+    if known or most <= 2.0 * np.pi:
+        return ()
+    return (
+        f"the yaw of {what} reaches {most:.3g} rad, more than a turn; if it is in degrees, add "
+        "`degrees: true`.",
+    )
+
+
+def _unix(times: Float[Array, " K"], unitless: bool) -> tuple[str, Array] | None:
+    """Return the unit of Unix time stamps, and seconds since the first; None for other times."""
+    # The number of digits states the unit.
+    sizes = {"s": 1.0} | ({"ms": 1e-3, "us": 1e-6, "ns": 1e-9} if unitless else {})
+    for unit, size in sizes.items():
+        since = (times - times[0]) * size
+        if _EPOCH[0] <= times[0] * size <= _EPOCH[1] and since[-1] <= _LASTS:
+            return unit, since
+    return None
+
+
+def _unwrapped(yaw: Float[Array, " K"]) -> Float[Array, " K"]:
+    """Return angles (rad) without jumps, if they lie within one turn, as recorders write them."""
+    rounding = 5e-3
+    # From 180 to -180 deg between few points is a turn that somebody wrote.
+    turn = np.ptp(yaw) == 2.0 * np.pi and len(yaw) < _RECORDED
+    centred = bool((np.abs(yaw) < np.pi + rounding).all()) and not turn
+    positive = bool((yaw > -rounding).all() and (yaw < 2.0 * np.pi).all())
+    return np.unwrap(yaw) if centred or positive else yaw
+
+
+# ---- on the Earth --------------------------------------------------------------------------------
+
+_RADIUS, _SQUARED = 6378137.0, 6.69437999014e-3
+"""WGS 84: equatorial radius (m) and squared eccentricity."""
+
+
+def _east_north_up(
+    file: PathLike, places: Float[Array, "K 3"], lines: Sequence[int], heights: bool
+) -> Float[Array, "K 3"]:
+    """Return places (latitude and longitude in rad, altitude in m) in m about the first one."""
+    limits = np.array([np.pi / 2.0, 2.0 * np.pi])
+    for k, axis in np.argwhere(np.abs(places[:, :2]) > limits)[:1]:
+        name, most = (("lat", 90), ("lon", 360))[axis]
+        raise ReferenceError(
+            f"`{name}` of the path at `{file}:{lines[k]}` is {np.degrees(places[k, axis]):.10g} "
+            f"deg, and must be from -{most} to {most} deg."
+        )
+    lat, lon, alt = places.T
+    normal = _RADIUS / np.sqrt(1.0 - _SQUARED * np.sin(lat) ** 2)
+    flat = (normal + alt) * np.cos(lat)
+    fixed = np.stack(
+        [flat * np.cos(lon), flat * np.sin(lon), (normal * (1.0 - _SQUARED) + alt) * np.sin(lat)]
+    )
+    (sp, sl), (cp, cl) = np.sin(places[0, :2]), np.cos(places[0, :2])
+    axes = np.array([[-sl, cl, 0.0], [-sp * cl, -sp * sl, cp], [cp * cl, cp * sl, sp]])
+    local = (axes @ (fixed - fixed[:, :1])).T
+    local[:, 2] *= heights
+    return local
+
+
+def _read_gpx(file: PathLike) -> Columns:
+    """Return time, latitude, longitude, altitude and yaw of the points of a GPX file."""
+    root = read_xml(file, "path", ReferenceError, "a GPX file")
+    kinds = (root.findall(f".//{{*}}{kind}") for kind in ("trkpt", "rtept", "wpt"))
+    points = next((found for found in kinds if found), [])
+    rows = []
+    for k, point in enumerate(points, 1):
+        texts = [point.get("lat"), point.get("lon"), point.findtext("{*}ele", "0")]
+        date = point.findtext("{*}time", "")
+        try:
+            place = [float(text or "") for text in texts]
+            rows.append([seconds_of(date.strip()), *np.radians(place[:2]), place[2], 0.0])
+        except ValueError:
+            seen = f"the time `{date}`, latitude, longitude and altitude {texts}"
+            raise ReferenceError(
+                f"point {k} of the path `{file}` has {seen}, and must have each."
+            ) from None
+    if len(rows) < 2:
+        raise ReferenceError(f"the path `{file}` must have 2 or more points, and has {len(rows)}.")
+    absent = () if root.find(".//{*}ele") is not None else ("alt",)
+    return Columns(np.array(rows), range(1, len(rows) + 1), absent, ())

@@ -1,5 +1,6 @@
 """Paths of polynomial pieces: through timed points, and as Crazyswarm2 and firmware fly them."""
 
+import contextlib
 import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -12,11 +13,13 @@ from jaxtyping import Float
 
 from echelon.agents.models.heading_symmetry import heading_of, rest_heading
 from echelon.agents.models.model import ControlAffine
-from echelon.agents.references.path_file import read_columns
+from echelon.agents.references.path_file import noted, read_points, yaw_notes
 from echelon.agents.references.reference import COORDINATES, Reference, numbers_of
+from echelon.agents.references.spline import ENDS, near, resampled, through
 from echelon.core.compiled import cached_jit
-from echelon.core.errors import ReferenceError, check_kind
+from echelon.core.errors import ReferenceError, check_kind, check_name, is_number
 from echelon.core.numerics import precision
+from echelon.core.text_table import Column, read_table
 from echelon.core.types import Array, PathLike, Scalar
 
 
@@ -59,6 +62,10 @@ class PolynomialPath(Reference):
         begun = [(min(end, horizon), path) for end, path in every[:count]]
         return [(end, path) for end, path in begun if end > 0.0]
 
+    def span(self) -> tuple[float, float]:
+        """Return the first and the last time, s."""
+        return float(self.knots[0]), float(self.knots[-1])
+
     def turns(self, model: ControlAffine) -> bool:
         """Tell whether the yaw is constant and the trim's; a polynomial path has no enclosure."""
         yaw = self.coefficients[..., 3]
@@ -76,11 +83,10 @@ def _horner(coefficients: Array | jax.Array, s: Scalar | float) -> Any:
 
 
 class Waypoints(PolynomialPath):
-    """The spline of degree 7 through `points` at `times`, at rest at both ends.
+    """The spline of degree 7 through `points` at `times`, at rest or free at both ends.
 
-    Before the first and after the last time the path is constant. Its derivatives are continuous up
-    to the sixth, so that a quadrotor can fly it (flatness needs four). The path starts and stops
-    with zero velocity, acceleration and jerk.
+    Before the first and after the last time the path is constant. Inside, its derivatives are
+    continuous up to the sixth, so that a quadrotor can fly it (flatness needs four).
 
     Args:
         times: K >= 2 increasing times, s.
@@ -88,17 +94,22 @@ class Waypoints(PolynomialPath):
         yaw: of all points, or of each; rad. A turn is as large as the numbers say: from 3 to -3 the
             path turns by 6 rad.
         degrees: whether the yaw is in degrees.
+        ends: `rest` with zero velocity, acceleration and jerk at both ends; `free` for a path that
+            moves there, as a recorded one (four points or more). Default `rest`, and `free` with
+            `smooth`.
+        smooth: largest distance (m, and rad of the yaw) of a smoother curve from the points; by
+            default the curve passes through them.
+        resample: step of points (s) that replace the given ones, on straight lines between them.
 
     Raises:
-        ReferenceError: the times do not increase, or points or yaw do not match them.
+        ReferenceError: the times do not increase, points or yaw do not match them, or no smooth
+            curve is within the distance.
     """
 
     knots: Array
     coefficients: Array
-    degrees: bool = eqx.field(static=True)
-
-    # Six inside; at rest at both ends up to the third.
-    joined = 3
+    ends: str = eqx.field(static=True)
+    notes: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(
         self,
@@ -106,48 +117,77 @@ class Waypoints(PolynomialPath):
         points: Sequence[Sequence[float]] | Array,
         yaw: float | Sequence[float] | Array = 0.0,
         degrees: bool = False,
+        ends: str | None = None,
+        smooth: float | None = None,
+        resample: float | None = None,
     ) -> None:
         t, p = _checked_points(times, points)
-        self.degrees = degrees
-        self.knots, self.coefficients = t, _fit(t, np.column_stack([p, _yaws(yaw, degrees, t)]))
+        ends = ("rest" if smooth is None else "free") if ends is None else ends
+        check_name("`ends` of `Waypoints` is", ends, ENDS, ReferenceError)
+        _check_positive(smooth=smooth, resample=resample)
+        rows = np.column_stack([p, _yaws(yaw, degrees, t)])
+        self.ends = ends
+        self.notes = yaw_notes("`Waypoints`", rows[:, 3], degrees)
+        t, rows = (t, rows) if resample is None else resampled(t, rows, resample)
+        fit = through(t, rows, ends) if smooth is None else near(t, rows, ends, smooth)
+        self.knots, self.coefficients = fit
+
+    @property
+    def joined(self) -> int:  # pyright: ignore
+        """Three derivatives are continuous where it comes to rest; none where it stops moving."""
+        return 3 if self.ends == "rest" else 0
 
     @classmethod
-    def read(cls, file: PathLike, degrees: bool = False) -> "Waypoints":
-        """Return the path through the points of a CSV file.
+    def read(
+        cls,
+        file: PathLike,
+        degrees: bool = False,
+        columns: Sequence[str] = (),
+        begin: float | None = None,
+        ends: str | None = None,
+        smooth: float | None = None,
+        resample: float | None = None,
+        model: ControlAffine | None = None,
+    ) -> "Waypoints":
+        """Return the path through the points of a table, or of a GPX file.
 
         Args:
-            file: its first line names the columns `t`, `x`, `y`, `z` and `yaw`, in any order; s, m
-                and rad. Without `yaw` it is 0.
-            degrees: whether the yaw is in degrees.
+            file: its columns are `t`, `x`, `y` and where given `z` and `yaw`, or `lat`, `lon` and
+                `alt`, which become metres east, north and up of the first point. They have the unit
+                in their header, else s, m and rad; others are not read.
+            degrees: whether a yaw without a unit is in degrees.
+            columns: names of the columns, instead of the file's.
+            begin: time of the first point, s; by default the file's, and 0 for Unix time stamps.
+            ends: as of the class, likewise the next two.
+            smooth: m.
+            resample: s.
+            model: that a missing `z` is remarked for.
 
         Raises:
             ReferenceError: the file cannot be read, or a line is wrong; the message names it.
         """
-        values, _ = read_columns(file, ("t", *COORDINATES), optional=("yaw",))
-        return cls(values[:, 0], values[:, 1:4], values[:, 4], degrees)
+        spatial = model is not None and "z" in model.flat_outputs
+        times, values, notes = read_points(file, degrees, columns, begin, spatial)
+        return noted(cls(times, values[:, :3], values[:, 3], False, ends, smooth, resample), notes)
 
-    def special_at(self, t: float) -> str:
-        """Return that the path starts from rest, or comes to rest, within its outer points."""
-        first, last = (float(x) for x in (self.knots[1], self.knots[-2]))
-        if not (t < first or t > last):
-            return ""
-        what, span = ("starts from", first - self.knots[0])
-        if t > last:
-            what, span = "comes to", self.knots[-1] - last
-        return (
-            f"the spline rests at both ends, and {what} rest within the {span:.3g} s between its "
-            f"{'last' if t > last else 'first'} two points"
-        )
+    def variants(self) -> Iterator[tuple[str, str, "Waypoints"]]:
+        """Yield what forces motion, and the same points without it: free ends, a smooth curve."""
+        last = _horner(self.coefficients[:, -1], self.knots[-1] - self.knots[-2])
+        points = np.concatenate([self.coefficients[-1], last[None]])
+        rest = ("rests at both ends", "ends: free", None)
+        each = [("passes through each point", f"smooth: {size:g}", size) for size in _TRIED]
+        for why, key, smooth in ([rest] if self.ends == "rest" else []) + each:
+            with contextlib.suppress(ReferenceError):
+                path = Waypoints(self.knots, points[:, :3], points[:, 3], False, "free", smooth)
+                yield why, key, path
 
     def remarks(self) -> tuple[str, ...]:
-        """Return what is probably wrong with the yaw: degrees that count as radians."""
-        most = float(np.abs(self.coefficients[-1, :, 3]).max())
-        if self.degrees or most <= 2.0 * math.pi:
-            return ()
-        return (
-            f"the yaw of `Waypoints` reaches {most:.3g} rad, more than a turn; if it is in "
-            "degrees, add `degrees: true`.",
-        )
+        """Return what is probably wrong: notes on its file, or degrees that count as radians."""
+        return self.notes
+
+
+_TRIED = (0.01, 0.05)
+"""Tolerances (m) of the smoother curves that are tried."""
 
 
 def _checked_points(
@@ -168,6 +208,14 @@ def _checked_points(
     return t, p
 
 
+def _check_positive(**options: float | None) -> None:
+    for name, number in options.items():
+        if number is not None and not (is_number(number) and 0.0 < number < math.inf):
+            raise ReferenceError(
+                f"`{name}` of `Waypoints` is {number}, and must be a positive number."
+            )
+
+
 def _yaws(yaw: float | Sequence[float] | Array, degrees: bool, times: Array) -> Float[Array, " K"]:
     values = numbers_of(yaw)
     if values.shape not in ((), times.shape) or not np.isfinite(values).all():
@@ -176,23 +224,6 @@ def _yaws(yaw: float | Sequence[float] | Array, degrees: bool, times: Array) -> 
             "one for each time."
         )
     return np.broadcast_to(np.radians(values) if degrees else values, times.shape)
-
-
-def _fit(times: Float[Array, " K"], points: Float[Array, "K 4"]) -> Float[Array, "8 K-1 4"]:
-    """Return the coefficients of the pieces, highest power first."""
-    # Imported here: splines load slowly, and only this reference needs them.
-    from scipy.interpolate import make_interp_spline
-
-    # A spline of degree 7 through K points has K + 6 coefficients: three conditions more at each
-    # end.
-    rest = [(order, np.zeros(4)) for order in (1, 2, 3)]
-    spline = make_interp_spline(times, points, k=7, bc_type=(rest, rest))
-    # Taylor's coefficients at each knot, which JAX evaluates without SciPy.
-    powers = [spline.derivative(k)(times[:-1]) / math.factorial(k) for k in range(7, 0, -1)]
-    coefficients = np.stack([*powers, points[:-1]])
-    # Rounding would let a constant coordinate move.
-    coefficients[:-1, :, (points == points[0]).all(axis=0)] = 0.0
-    return coefficients
 
 
 _COLUMNS = ("duration", *(f"{name}^{k}" for name in COORDINATES for k in range(8)))
@@ -243,17 +274,18 @@ class Polynomials(PolynomialPath):
         self.coefficients = np.moveaxis(_between(spans, ends), 2, 0)[::-1]
 
     @classmethod
-    def read(cls, file: PathLike) -> "Polynomials":
+    def read(cls, file: PathLike, columns: Sequence[str] = ()) -> "Polynomials":
         """Return the path in a CSV file of Crazyswarm2.
 
         Args:
-            file: its first line names the columns `duration`, `x^0` to `x^7`, and likewise for `y`,
-                `z` and `yaw`.
+            file: its columns are `duration`, `x^0` to `x^7`, and likewise for `y`, `z` and `yaw`.
+            columns: names of the columns, instead of the file's.
 
         Raises:
             ReferenceError: the file cannot be read, or a line is wrong; the message names it.
         """
-        values, lines = read_columns(file, _COLUMNS)
+        table = read_table(file, "path", ReferenceError).named(columns)
+        values, lines, *_ = table.columns([Column(name) for name in _COLUMNS])
         spans, powers = values[:, 0], values[:, 1:].reshape(len(values), len(COORDINATES), 8)
         for piece, fault in _faults(spans, powers):
             raise ReferenceError(f"the piece of the path at `{file}:{lines[piece]}` {fault}.")
@@ -324,7 +356,7 @@ def _faults(spans: Array, powers: Array) -> Iterator[tuple[int, str]]:
     ends = _ends(spans, powers)
     jumps = np.abs(ends[:-1, 1, 0] - ends[1:, 0, 0])
     for k in np.flatnonzero((jumps > _SAME).any(axis=1)):
-        where = f"{jumps[k, :3].max():.3g} m and {jumps[k, 3]:.3g} rad"
+        where = f"{np.linalg.norm(jumps[k, :3]):.3g} m and {jumps[k, 3]:.3g} rad"
         yield int(k) + 1, f"begins {where} from the end of the one before, and must begin there"
 
 

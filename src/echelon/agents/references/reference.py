@@ -2,7 +2,8 @@
 
 import abc
 import functools
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 from typing import ClassVar
 
 import jax
@@ -34,13 +35,17 @@ class LeaderPath(Declared):
         """Tell whether the heading may differ from the trim's at some time."""
         return True
 
-    def special_at(self, t: float) -> str:
-        """Return what is special about a path at a time (s), in words; empty for nothing."""
-        return ""
+    def variants(self) -> "Iterator[tuple[str, str, LeaderPath]]":
+        """Yield what may force motion, in words, with the key that ends it and the path then."""
+        yield from ()
 
     def remarks(self) -> tuple[str, ...]:
         """Return what is probably not meant, a sentence each."""
         return ()
+
+    def span(self) -> tuple[float, float]:
+        """Return the times (s) between which the path changes; it is constant outside."""
+        return -math.inf, math.inf
 
     @abc.abstractmethod
     def check(self) -> None:

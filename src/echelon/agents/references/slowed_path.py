@@ -1,7 +1,7 @@
 """A path in space at a fraction of its speed."""
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import final
 
 import jax
@@ -53,13 +53,19 @@ class SlowedPath(Reference):
         """Tell whether the heading may differ from the trim's at some time."""
         return self.path.turns(model)
 
-    def special_at(self, t: float) -> str:
-        """Return what is special about the path at a time (s); empty for nothing."""
-        return self.path.special_at(t / self.factor)
+    def variants(self) -> Iterator[tuple[str, str, LeaderPath]]:
+        """Yield what may force motion, with the key that ends it and the path then."""
+        for why, key, path in self.path.variants():
+            yield why, key, slowed(path, self.factor)
 
     def remarks(self) -> tuple[str, ...]:
         """Return what is probably not meant, a sentence each."""
         return self.path.remarks()
+
+    def span(self) -> tuple[float, float]:
+        """Return the times (s) between which the path changes."""
+        first, last = self.path.span()
+        return first * self.factor, last * self.factor
 
     def fit(self, model: ControlAffine) -> None:
         """Raise `LawError`, which says why, unless a model can be led along it."""

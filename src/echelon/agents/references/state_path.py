@@ -3,13 +3,15 @@
 from collections.abc import Sequence
 from typing import final
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
-from echelon.agents.references.path_file import read_columns
+from echelon.agents.references.path_file import noted, read_timed
 from echelon.agents.references.reference import LeaderPath, numbers_of
 from echelon.core.errors import LawError, ReferenceError, listing
+from echelon.core.text_table import Column
 from echelon.core.types import Array, Input, PathLike, Scalar, State
 
 _Rows = Sequence[Sequence[float]]
@@ -36,8 +38,10 @@ class StatePath(LeaderPath):
     times: Array
     states: Array
     inputs: Array
+    notes: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(self, times: Sequence[float], states: _Rows, inputs: _Rows) -> None:
+        self.notes = ()
         self.times = numbers_of(times)
         if self.times.ndim != 1 or len(self.times) < 2 or not (np.diff(self.times) > 0).all():
             raise ReferenceError(
@@ -49,17 +53,39 @@ class StatePath(LeaderPath):
         )
 
     @classmethod
-    def read(cls, file: PathLike, model: ControlAffine) -> "StatePath":
-        """Return the path in a CSV file, whose first line names `t`, the states and the inputs.
+    def read(
+        cls,
+        file: PathLike,
+        model: ControlAffine,
+        columns: Sequence[str] = (),
+        begin: float | None = None,
+    ) -> "StatePath":
+        """Return the path in a table whose columns are `t`, the model's states and its inputs.
 
-        The columns may be in any order.
+        Args:
+            file: the table; its columns are in any order, and others are not read.
+            model: states and inputs have its names, and its units where the file states none.
+            columns: names of the columns, instead of the file's.
+            begin: time of the first knot, s; by default the file's.
 
         Raises:
             ReferenceError: the file cannot be read, or a line is wrong; the message names it.
         """
-        values, _ = read_columns(file, ("t", *model.state_names, *model.input_names))
-        times, states, inputs = np.split(values, [1, 1 + len(model.state_names)], axis=1)
-        return cls(times[:, 0], states, inputs)  # pyright: ignore[reportArgumentType]
+        names = (*model.state_names, *model.input_names)
+        units = (*model.state_units, *model.input_units)
+        wanted = [Column(name, unit) for name, unit in zip(names, units, strict=True)]
+        times, values, notes = read_timed(file, wanted, columns, begin)
+        states, inputs = np.split(values, [len(model.state_names)], axis=1)
+        path = cls(times, states, inputs)  # pyright: ignore[reportArgumentType]
+        return noted(path, notes)
+
+    def span(self) -> tuple[float, float]:
+        """Return the times of the first and the last knot, s."""
+        return float(self.times[0]), float(self.times[-1])
+
+    def remarks(self) -> tuple[str, ...]:
+        """Return the notes on its file."""
+        return self.notes
 
     def follow(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:
         """Return the state (n,) and the input (m,) at time t."""

@@ -25,6 +25,7 @@ from echelon.core.errors import (
     FormationError,
     MissingExtraError,
     ModelError,
+    ReferenceError,
     ScenarioError,
     did_you_mean,
     listing,
@@ -160,7 +161,7 @@ class _Builder:
             lambda: Settings(**numbers, seed=scenario.seed, steady_window=window), "simulation"
         )
         self.model = self.part(self._model, "model")
-        self.graph = self.part(lambda: _graph(scenario.graph), "graph")
+        self.graph = self.part(lambda: _graph(scenario.graph, scenario.folder), "graph")
         self.reference = self.part(self._reference, "reference")
         self.settle()
 
@@ -281,7 +282,9 @@ class _Builder:
         file = None if spec.file is None else self.scenario.folder / spec.file
         reference = part.create() if file is None else _read(part, file, model=self.model)
         check_reference(reference)
-        return slowed(reference, spec.slowdown)
+        reference = slowed(reference, spec.slowdown)
+        _check_span(reference, self.scenario.simulation.horizon)
+        return reference
 
     def _formation(self) -> Formation:
         spec, starts = self.scenario.formation, self.scenario.initial.states
@@ -488,7 +491,9 @@ class _Builder:
         return events
 
 
-def _graph(spec: GraphSpec) -> Graph:
+def _graph(spec: GraphSpec, folder: Path) -> Graph:
+    if spec.file is not None:
+        return Graph.read(folder / spec.file, spec.leaders, spec.directed or None)
     if spec.edges is not None:
         rest = spec.leaders, spec.agents, spec.directed
         if spec.schedule:
@@ -497,6 +502,18 @@ def _graph(spec: GraphSpec) -> Graph:
     make = getattr(Graph, str(spec.name))
     graph = make(**offered(make, spec.model_dump(exclude_none=True)))
     return graph.one_way() if spec.directed and not graph.directed else graph
+
+
+def _check_span(reference: LeaderPath, horizon: float) -> None:
+    """Refuse a path of which nothing lies within the run."""
+    first, last = reference.span()
+    if first < horizon and last > 0.0:
+        return
+    when = f"begins at {first:.10g} s" if first > 0.0 else f"ends at {last:.10g} s"
+    raise ReferenceError(
+        f"the path {when}, and the run is from 0 to {horizon:g} s; for a path from a file give "
+        "`begin: 0`, or the unit of its times, as in `t [ms]`."
+    )
 
 
 def _event(spec: EventSpec) -> Event:

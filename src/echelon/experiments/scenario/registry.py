@@ -63,9 +63,9 @@ REFERENCES = _family(
     circle=("Circle", "circle at constant height"),
     hover=("Hover", "one fixed point"),
     line=("Line", "straight line at constant velocity"),
-    waypoints=("Waypoints", "smooth path through timed points, from the scenario or a CSV file"),
+    waypoints=("Waypoints", "smooth path through timed points, from the scenario, a table or GPX"),
     polynomials=("Polynomials", "pieces of degree 7, from a CSV file as Crazyswarm2 reads it"),
-    states=("StatePath", "states and inputs over time, from a CSV file, of any model"),
+    states=("StatePath", "states and inputs over time, from a table, of any model"),
 )
 
 METHODS = _family(

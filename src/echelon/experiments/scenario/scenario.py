@@ -5,7 +5,7 @@ All faults of a file are reported at once, a line each: `file:line: field: got .
 
 import copy
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, TypeAlias, final
 
@@ -28,6 +28,7 @@ from echelon.experiments.scenario.yaml import (
     is_or_are,
     joined,
     part_at,
+    plain,
     quoted,
     read_yaml,
     rename_files,
@@ -116,8 +117,7 @@ class Scenario(Section):
             ScenarioError: the changed scenario has faults, as in `load_scenario`.
         """
         named = (
-            f"{key.replace('__', '.')}={inline_yaml(_plain(value))}"
-            for key, value in values.items()
+            f"{key.replace('__', '.')}={inline_yaml(plain(value))}" for key, value in values.items()
         )
         try:
             return with_overrides(self, [*changes, *named])
@@ -341,9 +341,12 @@ def _rivals(path: KeyPath, part: Any) -> list[Any]:
         return [other for other in foreign_keys(section, law) if other in part] if known else []
     if key not in section.one_of:
         return []
-    # A gain file contains what the other keys would say.
-    excluded = part if key == "file" else section.one_of
-    return [other for other in excluded if other in part and other != key]
+    excluded = {*section.one_of}
+    if key == "file":
+        # It contains what the other keys would say, and arguments of a class of the user.
+        names = {field.alias or name for name, field in section.model_fields.items()}
+        excluded |= {*foreign_keys(section, key)} | ({*part} - names)
+    return [other for other in part if other in excluded and other != key]
 
 
 def scenario_from_text(text: str, file: Path) -> Scenario:
@@ -365,15 +368,6 @@ def with_overrides(scenario: Scenario, overrides: Sequence[str]) -> Scenario:
     return _scenario(document, dump_yaml(document.data), scenario.file)
 
 
-def _plain(value: object) -> object:
-    """Return data with lists for tuples and arrays, and Python numbers for NumPy numbers."""
-    to_list: Callable[[], object] | None = getattr(value, "tolist", None)
-    value = value if to_list is None else to_list()
-    if isinstance(value, Mapping):
-        return {_plain(key): _plain(item) for key, item in value.items()}
-    return list(map(_plain, value)) if isinstance(value, list | tuple) else value
-
-
 def scenario_from_mapping(data: Mapping[str, Any], folder: str | Path = ".") -> Scenario:
     """Check a scenario given as a mapping, with the keys of the file.
 
@@ -384,8 +378,8 @@ def scenario_from_mapping(data: Mapping[str, Any], folder: str | Path = ".") -> 
     Raises:
         ScenarioError: The scenario has faults, as in `load_scenario`.
     """
-    plain = _plain(data)
-    return _scenario(Document(plain, {(): "mapping"}), dump_yaml(plain), Path(folder) / "mapping")
+    data = plain(data)
+    return _scenario(Document(data, {(): "mapping"}), dump_yaml(data), Path(folder) / "mapping")
 
 
 ScenarioLike: TypeAlias = Scenario | str | Path | Mapping[str, Any]

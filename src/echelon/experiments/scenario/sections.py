@@ -104,13 +104,13 @@ class StretchSpec(Section):
 
 
 @final
-class GraphSpec(Section, **either("edges", "name")):
-    """The communication graph: a list of edges, or the name of a generated graph.
+class GraphSpec(Section, **either("edges", "name", "file")):
+    """The communication graph: a list of edges, the name of a generated graph, or a file.
 
     Agents are numbered from 0.
     """
 
-    one_of: ClassVar = ("edges", "name")
+    one_of: ClassVar = ("edges", "name", "file")
     edges: Edges | None = None
     """Edges `[i, j]` or `[i, j, weight]`; the weight has no unit, default 1. Each end receives from
     the other, unless `directed`."""
@@ -128,6 +128,10 @@ class GraphSpec(Section, **either("edges", "name")):
     """Period with which the edges of the `schedule` repeat, s."""
     name: Annotated[str, OneOf(registry.GRAPHS)] | None = None
     """Name of a generated graph; the keys below are its parameters."""
+    file: str | None = None
+    """File of the graph, relative to the scenario file: a table of edges (from, to, weight) or an
+    adjacency matrix, GraphML, or a sparse matrix of SciPy (`.npz`). With `directed` every edge is
+    directed; without, GraphML says so, or a matrix that is not symmetric."""
     agents: Annotated[
         Count | None,
         TakenBy("edges", "grid", needed_by=("path", "ring", "star", "complete", "geometric")),
@@ -249,18 +253,33 @@ class ReferenceSpec(Section):
     python: ClassInFile | None = None
     """`file.py:Class`, the file relative to the scenario file."""
     file: str | None = None
-    """CSV file of the path, relative to the scenario file; its first line names the columns, in any
-    order. `waypoints` has `t`, `x`, `y`, `z`, `yaw`; `states` has `t`, the states and the inputs;
-    `polynomials` has `duration`, `x^0` to `x^7`, and likewise for `y`, `z`, `yaw`."""
+    """Table of the path, relative to the scenario file, with named columns in any order.
+    `waypoints` has `t`, `x`, `y` and where given `z`, `yaw`, or `lat`, `lon`, `alt`, or is a GPX
+    file; `states` has `t`, the states and the inputs; `polynomials` has `duration`, `x^0` to
+    `x^7`, and likewise for `y`, `z`, `yaw`."""
+    columns: Annotated[tuple[str, ...], Field(strict=False)] = ()
+    """Names of the columns of `file`, in its order, in place of its header or without one."""
+    begin: Annotated[float | None, Unit("s")] = None
+    """Time at which the path of `file` begins, s; by default its own, 0 for Unix time stamps."""
     degrees: bool = False
-    """Whether the yaw of `waypoints` is in degrees."""
+    """Whether the yaw of `waypoints` is in degrees; a unit in the header of `file` is used."""
+    ends: Annotated[str, OneOf(("rest", "free"))] | None = None
+    """Whether `waypoints` begin and end at rest, or move there, as recorded paths do (`free`);
+    default `rest`, and `free` with `smooth`."""
+    smooth: Annotated[Positive | None, Unit("m")] = None
+    """Largest distance of a smooth curve from the `waypoints`, m (of the yaw, rad); by default it
+    passes through them."""
+    resample: Annotated[Positive | None, Unit("s")] = None
+    """Step of points that replace the `waypoints`, s, on straight lines between them."""
     slowdown: Annotated[Positive, Unit("1")] = 1.0
     """Factor on the time that the path takes: 2 for half of its speed; not for `states`."""
 
     @property
     def parameters(self) -> Mapping[str, object]:
         """The reference's parameters: numbers or nested tuples of numbers, in m, s and rad."""
-        return {**(self.__pydantic_extra__ or {}), **({"degrees": True} if self.degrees else {})}
+        keys = ("columns", "begin", "degrees", "ends", "smooth", "resample")
+        given = {key: getattr(self, key) for key in keys if key in self.model_fields_set}
+        return {**(self.__pydantic_extra__ or {}), **given}
 
 
 @final

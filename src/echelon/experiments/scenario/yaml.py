@@ -10,7 +10,7 @@ import io
 import re
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, final
 
 from ruamel.yaml import YAML
@@ -132,8 +132,7 @@ class _Reading:
             text = "got a list or mapping as a key, allowed is a word or a number."
             self.add_fault(node, path, text)
             return "?"
-        key = self.meaning(node)
-        return key if type(key) is int else str(node.value)
+        return key_of(self.meaning(node), str(node.value))
 
     def add_fault(self, node: Node, path: KeyPath, message: str) -> None:
         self.faults.append(ScenarioFault(self.line(node), joined(path), message))
@@ -181,6 +180,23 @@ def read_yaml(text: str, file: str) -> Document:
     return _read(text, lambda line: f"{file}:{line}")
 
 
+def key_of(key: object, text: str) -> str | int:
+    """Return a key as a whole number if it is one, or its text, as in JSON; else as text."""
+    if type(key) is int:
+        return key
+    return int(text) if re.fullmatch("0|[1-9][0-9]{0,8}", text) else text
+
+
+def plain(value: object) -> Any:
+    """Return data with lists for tuples and arrays, and Python numbers for NumPy numbers."""
+    to_list: Callable[[], object] | None = getattr(value, "tolist", None)
+    value = value if to_list is None else to_list()
+    if isinstance(value, Mapping):
+        keys = ((plain(key), item) for key, item in value.items())
+        return {key_of(k, k) if isinstance(k, str) else k: plain(item) for k, item in keys}
+    return list(map(plain, value)) if isinstance(value, list | tuple) else value
+
+
 def _override(text: str) -> tuple[KeyPath, object, str]:
     """Return the path, the value and the place of `a.b=3`."""
     place = "--set " + " ".join(text.split())
@@ -194,7 +210,7 @@ def _override(text: str) -> tuple[KeyPath, object, str]:
     document = _read(value, lambda line: place)
     if document.faults:
         raise ScenarioError(f"{place}: {document.faults[0].message}")
-    path = tuple(int(part) if re.fullmatch("[0-9]{1,9}", part) else part for part in parts)
+    path = tuple(key_of(part, part) for part in parts)
     return path, document.data, place
 
 
@@ -207,8 +223,6 @@ def _replace(
     copy: Any = dict(at or {}) if at is None or isinstance(at, dict) else at
     key: Any = rest[0]
     if isinstance(copy, dict):
-        # a whole number is an int key (an agent), unless the mapping has it as text already
-        key = str(key) if str(key) in copy else key
         copy.setdefault(key)
     elif isinstance(copy, list) and isinstance(key, int) and key < len(copy):
         copy = list(copy)

@@ -2,8 +2,9 @@
 
 import dataclasses
 import io
+from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, final
 
 import equinox as eqx
 import jax
@@ -16,7 +17,13 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.references.reference import LeaderPath
 from echelon.agents.world.world import World
 from echelon.core.digits import about
-from echelon.core.errors import LawError, OutputError, SimulationError, check_kind
+from echelon.core.errors import (
+    LawError,
+    MissingExtraError,
+    OutputError,
+    SimulationError,
+    check_kind,
+)
 from echelon.core.files import write_atomic
 from echelon.core.numerics import precision
 from echelon.core.types import Array, Input, PathLike, Scalar, State, States
@@ -36,13 +43,48 @@ _REST = 1e-9
 """In the states' units per second; more than rounding leaves at a rest."""
 
 
-class StateSpace(NamedTuple):
-    """A linear system xdot = A x + B w, y = C x + D w; `state_space` says what x, w and y are."""
+@final
+@dataclasses.dataclass(frozen=True, eq=False)
+class StateSpace:
+    """A linear system xdot = A x + B w, y = C x + D w; `state_space` says what x, w and y are.
+
+    `A, B, C, D = system` unpacks it.
+
+    Attributes:
+        A, B, C, D: its matrices.
+        states: names of x, such as `vx_1` of agent 1.
+        inputs: names of w, such as `path_x`.
+        outputs: names of y, such as `error_x_1`.
+    """
 
     A: Float[Array, "Nn Nn"]
     B: Float[Array, "Nn k"]
     C: Float[Array, "Nn Nn"]
     D: Float[Array, "Nn k"]
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+    def __iter__(self) -> Iterator[Array]:
+        """Yield A, B, C and D."""
+        yield from (self.A, self.B, self.C, self.D)
+
+    def to_control(self) -> Any:
+        """Return it as a `StateSpace` of python-control, with its names.
+
+        Raises:
+            MissingExtraError: python-control is not installed.
+        """
+        try:
+            import control  # pyright: ignore[reportMissingImports]
+        except ImportError as error:
+            raise MissingExtraError(
+                "`to_control` needs python-control; install it with `pip install '.[control]'`."
+            ) from error
+        # `ss` would remove states that nothing drives.
+        names = {"states": self.states, "inputs": self.inputs, "outputs": self.outputs}
+        lists = {key: list(value) for key, value in names.items()}
+        return control.StateSpace(*self, remove_useless_states=False, **lists)
 
 
 class _Momentary(LeaderPath):
@@ -101,7 +143,7 @@ def state_space(parts: Parts, file: PathLike | None = None) -> StateSpace:
     with precision("float64"):
         system = _linearized(loop, ready.parts)
     if file is not None:
-        _write(system, parts, Path(file))
+        _write(system, Path(file))
     return system
 
 
@@ -159,24 +201,24 @@ def _linearized(loop: Loop, parts: Parts) -> StateSpace:
     )
     size = count * n
     shapes = ((A, size), (B, len(motion)), (C, size), (D, len(motion)))
-    return StateSpace(*(np.asarray(part).reshape(size, columns) for part, columns in shapes))
+    A, B, C, D = (np.asarray(part).reshape(size, columns) for part, columns in shapes)
+    states = tuple(f"{name}_{k}" for k in range(count) for name in model.state_names)
+    path = tuple(f"path_{name}" for name in (*model.state_names, *model.input_names))
+    outputs = tuple(f"error_{name}" for name in states)
+    return StateSpace(A, B, C, D, states, path[: len(motion)], outputs)
 
 
-def _write(system: StateSpace, parts: Parts, file: Path) -> None:
+def _write(system: StateSpace, file: Path) -> None:
     """Write the system with its names, as cell arrays."""
     from scipy.io import savemat
 
-    model, agents = parts.model, range(parts.graph.agents)
-    states = [f"{name}_{k}" for k in agents for name in model.state_names]
-    path = [f"path_{name}" for name in (*model.state_names, *model.input_names)]
-    names = {
-        "states": states,
-        "inputs": path[: system.B.shape[1]],
-        "outputs": [f"error_{name}" for name in states],
-    }
     content = io.BytesIO()
-    cells = {name: np.array(texts, dtype=object) for name, texts in names.items()}
-    savemat(content, {**system._asdict(), **cells}, oned_as="column")
+    # MATLAB has cell arrays for lists of text.
+    cells = {
+        name: np.array(value, dtype=object) if isinstance(value, tuple) else value
+        for name, value in vars(system).items()
+    }
+    savemat(content, cells, oned_as="column")
     try:
         write_atomic(file, content.getvalue())
     except OSError as error:

@@ -14,7 +14,7 @@ from echelon.core.errors import ScenarioError
 from echelon.core.limits import excess_runs
 from echelon.experiments.results.run_numbers import AGENT_NUMBERS, RUN_NUMBERS, Appearance, shown_in
 from echelon.experiments.scenario.scenario import Scenario, with_overrides
-from echelon.experiments.scenario.yaml import inline_yaml, read_yaml
+from echelon.experiments.scenario.yaml import inline_yaml, plain, read_yaml
 
 if TYPE_CHECKING:
     from echelon.core.types import Array
@@ -78,7 +78,10 @@ def axes_of(values: Mapping[str, Iterable[Any]]) -> tuple[Axis, ...]:
         if isinstance(v, str) or not isinstance(v, Iterable):
             raise ScenarioError(f"--over {key}: got {v!r}, allowed is a list of values, as [1, 2].")
     return _checked(
-        [Axis(key, v if isinstance(v, range) else tuple(v)) for key, v in values.items()]
+        [
+            Axis(key, v if isinstance(v, range) else tuple(map(plain, v)))
+            for key, v in values.items()
+        ]
     )
 
 
