@@ -176,7 +176,7 @@ def _until_last(
     else:
         after, slopes = _maps(early, np.eye(len(rest.value)), steps)
     if not (np.abs(after - rest.value) <= _AT_REST * _scale(rest.value)).all():
-        return found._replace(faults=(Fault.NO_REST,), radius=None)
+        return found._replace(faults=(Fault.NO_REST,), radius=None, map=None)
     if slopes is None:
         return found
     at = rest.body.state[rest.free] >= 0
