@@ -84,6 +84,7 @@ def _step_lines(steps: Split | None, dt: float) -> Iterator[Statement]:
     else:
         text = f"z late by whole steps, up to {amount(delay.steps, 'step')} of {dt:g} s; one more"
         text += f" is too late for lambda = {about(delay.eigenvalue)}"
+        text += "" if delay.each else "; beyond 20 steps every tenth part was tried"
     yield holds(Topic.DELAY, _KIND, text, delay.steps * dt, f"{about(1e3 * delay.steps * dt)} ms")
     best = delay_margin(steps._replace(eigenvalues=np.array([low]), between=False))
     high = np.abs(steps.eigenvalues).max()

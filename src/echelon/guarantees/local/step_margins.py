@@ -141,11 +141,13 @@ class DelayMargin(NamedTuple):
 
     Attributes:
         steps: all delays up to it that were tried decay; -1 where not even current z are shown to.
+        each: whether every whole number of steps up to it was tried.
         last: whether no more were tried.
         eigenvalue: of what agents hear, whose mode grows most one step later; None with `last`.
     """
 
     steps: int
+    each: bool
     last: bool
     eigenvalue: complex | None
 
@@ -154,13 +156,14 @@ def delay_margin(split: Split) -> DelayMargin:
     """Return how many steps all disagreements may be late, in the steps that run."""
     loci = [_Locus(F, K, split) for F, K in _driven(split)]
     steps = last_delay(lambda d: all(locus.decays(d) for locus in loci), _MOST, _EACH)
+    each = steps < _EACH
     if steps == _MOST or steps < 0:
-        return DelayMargin(steps, steps == _MOST, None)
+        return DelayMargin(steps, each, steps == _MOST, None)
     values = split.eigenvalues
     few = values[np.unique(np.linspace(0, len(values) - 1, _CHUNK).astype(int))]
     radii = [max(locus.radius(k, steps + 1) for locus in loci) for k in few]
     worst = complex(few[int(np.argmax(radii))])
-    return DelayMargin(steps, False, worst if worst.imag else worst.real)
+    return DelayMargin(steps, each, False, worst if worst.imag else worst.real)
 
 
 class _Locus:
