@@ -281,6 +281,9 @@ def solve(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Ar
     if len(b) != 1:
         raise Unsupported(f"`custom_linear_solve` of several vectors{where(equation)}")
     [right] = b
+    # Of a group without agents.
+    if not right.size:
+        return [right]
     columns = []
     for k in range(right.size):
         unit = np.zeros(right.size)

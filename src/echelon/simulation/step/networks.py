@@ -512,11 +512,17 @@ class LateNetwork(IdealNetwork):
     def send(self, loop: Loop, memory: PyTree, known: Known, speech: LeaderSpeech) -> PyTree:
         """Return the network after what agents send now."""
         in_flight, mail = memory
+        sent, sends = self.written(loop, mail, known, speech)
+        return self.posted(in_flight, known.clock.step, sent, sends, known.links), mail
+
+    def written(
+        self, loop: Loop, mail: Messages, known: Known, speech: LeaderSpeech
+    ) -> tuple[Messages, Bool[jax.Array, " N"]]:
+        """Return what agents write, and which of them can."""
         content = self.rules.contents(loop, mail, known, speech)
-        clock, difference = known.clock, loop.laws.speech.difference(loop.model)
-        rows = known.own.number, clock.now, known.said, content, difference
-        sent, sends = self.rules.write(mail, known.heard, *rows)
-        return self.posted(in_flight, clock.step, sent, sends, known.links), mail
+        difference = loop.laws.speech.difference(loop.model)
+        rows = known.own.number, known.clock.now, known.said, content, difference
+        return self.rules.write(mail, known.heard, *rows)
 
     def with_medium(self, medium: Channel) -> IdealNetwork:
         """Return the network over another medium."""
