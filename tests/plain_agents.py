@@ -2,15 +2,17 @@
 
 import itertools
 import math
+import types
 
 import numpy as np
 
 import echelon as ech
 from echelon.agents.network.inbox import LeaderPacket, NamedValues
 from echelon.simulation.engine.agent import hull_names
-from echelon.simulation.onboard.agent_functions import message_sizes, senders_of
+from echelon.simulation.onboard.agent_functions import agent_functions, message_sizes, senders_of
 from echelon.simulation.onboard.source_code import python_text
 from echelon.simulation.step.leadership import NOBODY
+from echelon_flight.pilot import Pilot
 
 EPS = np.finfo(float).eps
 
@@ -66,6 +68,15 @@ class PlainAgent:
         u, after, message, valid = self.law["step"](*self.inputs(t, x))
         self.memory = after if valid else self.memory
         return u, message, valid
+
+
+def pilot_of(agent, backups=()):
+    """A pilot with the exported law of an agent."""
+    own = agent.own_law
+    facts = {"agent": agent.number, "leads": own.leads, "hears": senders_of(own)}
+    facts |= {"message": message_sizes(own), "network": {"leaders": own.loop.laws.leaders.tolist()}}
+    law = types.SimpleNamespace(**as_python(agent_functions(own).values()))
+    return Pilot(law, facts, backups)
 
 
 def named(part, names):

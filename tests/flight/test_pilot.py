@@ -1,18 +1,16 @@
 """A pilot with an exported law does what `Agent` does, with the same letters."""
 
 import math
-import types
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from plain_agents import Draws, PlainAgent, as_python, check
+from plain_agents import Draws, PlainAgent, check, pilot_of
 
 import echelon as ech
 from echelon.agents.network.formation_motion import Rotate
-from echelon.simulation.onboard.agent_functions import agent_functions, message_sizes, senders_of
 from echelon_flight import wire
-from echelon_flight.pilot import NOBODY, Pilot
+from echelon_flight.pilot import NOBODY
 
 CARTS, DT = ech.models.DoubleIntegrator(), 0.01
 
@@ -27,14 +25,6 @@ def parts_of(sensing=None, changes=(), leadership=None, **network):
         places = places.moving(CARTS, graph, changes)
     world = ech.World(network=ech.Network(rate=25.0, **network), sensing=sensing)
     return ech.Parts(CARTS, graph, places, drive, world=world, leadership=leadership)
-
-
-def pilot_of(agent, backups=()):
-    own = agent.own_law
-    facts = {"agent": agent.number, "leads": own.leads, "hears": senders_of(own)}
-    facts |= {"message": message_sizes(own), "network": {"leaders": own.loop.laws.leaders.tolist()}}
-    law = types.SimpleNamespace(**as_python(agent_functions(own).values()))
-    return Pilot(law, facts, backups)
 
 
 NOISE = ech.Sensing(noise={"position": 0.05}, estimator="constant-gain")

@@ -7,7 +7,7 @@ import dataclasses
 import functools
 import math
 import operator
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import final
 
 import jax
@@ -87,7 +87,9 @@ class _Traces:
     def __init__(self, own: OwnLaw, bits: int) -> None:
         self.own, self.bits, self.sizes = own, bits, message_sizes(own)
         self.loop = alone(own.loop, own.number, Arrived(*np.zeros((2, 0))), own.schedule)
-        self.late = isinstance(own.loop.network, LateNetwork)
+        network = own.loop.network
+        self.late = isinstance(network, LateNetwork)
+        self.needs_packet = isinstance(network, LateNetwork) and network.rules.content.needs_packet
         self.senders, self.width = senders_of(own), sum(self.sizes.values())
         self.n = len(self.loop.model.state_names)
 
@@ -142,9 +144,9 @@ class _Traces:
             sent: Messages = jax.tree.map(lambda row: row[0], acted.memory.network[0])
             leader, stamp, content, term = sent.packet
             none = stamp == NEVER
-            silent = none if self.own.loop.network.rules.content.needs_packet else False
-            head = [jnp.where(silent, jnp.nan, t), sent.hops]
-            packet = [leader, jnp.where(none, jnp.nan, stamp), content, *jax.tree.leaves(term)]
+            head = [jnp.where(none, jnp.nan, t) if self.needs_packet else t, sent.hops]
+            packet = [leader, stamp, content, *jax.tree.leaves(term)]
+            packet = [jnp.where(none, jnp.nan, part) for part in packet]
             parts = [*head, sent.value, *packet, near]
         message = _flat([jnp.asarray(part, t.dtype) for part in parts])
         return acted.inputs[0], _flat(after), message, _flat(_floats((rows[0], acted)))
@@ -217,7 +219,7 @@ def _function(
     about: str,
     compute: Callable[..., PyTree],
     outputs: tuple[str, ...],
-    sizes: dict[str, int | None],
+    sizes: Mapping[str, int | None],
     bits: int = 64,
 ) -> LawFunction:
     """Return a function; what `compute` returns after its outputs is finite where it is valid."""

@@ -50,8 +50,8 @@ class Arrived(NamedTuple):
         hulls: (L, r, d) of all others; no rows where agents do not keep apart.
     """
 
-    signals: Float[Array, "K s"]
-    forward: Float[Array, " k"]
+    signals: Float[Array | jax.Array, "K s"]
+    forward: Float[Array | jax.Array, " k"]
     messages: PyTree = ()
     hulls: PyTree = ()
 
