@@ -14,7 +14,10 @@ CHANGES = {
         ["safety=null", "formation.motion=[{rotate: 0.5}, {scale: 0.3, rate: 0.7}]"],
     ),
     "paper, links cut": ("paper", ["events=[{at: 20.0, cut: [1, 2], for: 20.0}]"]),
-    "paper, links cut and back": ("paper", ["graph.switching={period: 3.0, at: {0: [[0, 1]]}}"]),
+    "paper, switching": (
+        "paper",
+        ["graph.schedule=[{at: 2.0, edges: [[0, 3], [3, 2], [2, 1]]}]", "graph.period=5.0"],
+    ),
 }
 STEPS, MANY = 12, 10_000
 

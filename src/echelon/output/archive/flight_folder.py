@@ -40,12 +40,7 @@ from echelon.simulation.onboard.message_words import (
     message_words,
     normalized_equation,
 )
-from echelon.simulation.onboard.source_code import (
-    LawFunction,
-    c_text,
-    header_text,
-    python_text,
-)
+from echelon.simulation.onboard.source_code import LawFunction, c_text, header_text, python_text
 from echelon.simulation.scalars import Unsupported
 from echelon.simulation.step.networks import LateNetwork
 from echelon.simulation.step.settings import Settings
@@ -171,12 +166,8 @@ def _network_facts(own: OwnLaw, dt: float) -> JsonObject | None:
     network = own.loop.network
     if not isinstance(network, LateNetwork):
         return None
-    leaders = own.loop.laws.leaders.tolist()
-    return {
-        "period": int(network.medium.every) * dt,
-        "messages": str(network.medium.messages),
-        "leaders": leaders,
-    }
+    period, messages = int(network.medium.every) * dt, str(network.medium.messages)
+    return {"period": period, "messages": messages, "leaders": own.loop.laws.leaders.tolist()}
 
 
 def save_law(files: Mapping[str, str], folder: Path) -> None:

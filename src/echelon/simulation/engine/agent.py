@@ -55,7 +55,6 @@ class OwnLaw(NamedTuple):
         leads: whether it is a leader.
         number: of the agent.
         neighbours: the numbers of those that it hears.
-        weights: of their signals (rows, K); a graph that switches has several rows.
         signal_names, forward_names: of what it sends.
         source: whose feed-forward it uses; None for nobody's.
         schedule: when which row of weights holds, of a graph that switches.
@@ -65,7 +64,6 @@ class OwnLaw(NamedTuple):
     leads: bool
     number: int
     neighbours: tuple[int, ...]
-    weights: Array
     signal_names: tuple[str, ...]
     forward_names: tuple[str, ...]
     source: int | None
@@ -326,10 +324,9 @@ def _own_law(loop: Loop, parts: Parts, number: int) -> OwnLaw:
     exchange, leads = loop.graph.exchange, number in parts.graph.leaders
     edges = np.asarray(exchange.receivers) == number
     neighbours = tuple(np.asarray(exchange.senders)[edges].tolist())
-    weights = np.atleast_2d(np.asarray(exchange.weights))[:, edges]
     with precision("float64"):
         names = _names(loop, loop.laws.leader if leads else loop.laws.follower)
-    rows = neighbours, weights, *names, _source_in(loop, parts, number, leads)
+    rows = neighbours, *names, _source_in(loop, parts, number, leads)
     return OwnLaw(loop, leads, number, *rows, parts.graph.schedule)
 
 

@@ -20,17 +20,9 @@ from echelon.core.types import PyTree, State
 from echelon.simulation.engine.agent import OwnLaw, hull_names
 from echelon.simulation.onboard.message_words import normalized_equation
 from echelon.simulation.onboard.source_code import LawFunction
-from echelon.simulation.scalars import (
-    Node,
-    ScalarGraph,
-    Unsupported,
-    lower,
-    nodes,
-    rewritten,
-)
+from echelon.simulation.scalars import Node, ScalarGraph, Unsupported, lower, nodes, rewritten
 from echelon.simulation.step.alone import (
     Arrived,
-    OwnMemory,
     after_mail,
     alone,
     begin_alone,
@@ -40,7 +32,7 @@ from echelon.simulation.step.leadership import NOBODY
 from echelon.simulation.step.motion import PlantStep
 from echelon.simulation.step.networks import LateNetwork
 from echelon.simulation.step.own_members import own_classes
-from echelon.simulation.step.records import Control, LeaderPackets, Messages
+from echelon.simulation.step.records import LeaderPackets, Messages
 
 
 def senders_of(own: OwnLaw) -> list[int]:
@@ -66,18 +58,15 @@ def message_sizes(own: OwnLaw) -> dict[str, int]:
 def agent_functions(own: OwnLaw, bits: int = 64) -> dict[str, LawFunction]:
     """Return what an agent computes, in 64 or 32 bits; else `Unsupported`, with the user's line."""
     _check_members(own)
-    functions = _Traces(own, bits).all()
-    return {function.name: function for function in functions}
+    return {function.name: function for function in _Traces(own, bits).all()}
 
 
 def _check_members(own: OwnLaw) -> None:
     """Raise `Unsupported` where an agent by itself has echelon's member in place of the user's."""
-    network, near = own.loop.network, own.loop.surroundings
+    loop, network = own.loop, own.loop.network
     rules = [network.leadership, network.rules] if isinstance(network, LateNetwork) else []
-    inner = (
-        kind for part in (own.loop.turns, own.loop.graph, *rules) for kind in own_classes(part)
-    )
-    for kind in (type(network), type(near), *inner):
+    inner = (kind for part in (loop.turns, loop.graph, *rules) for kind in own_classes(part))
+    for kind in (type(network), type(loop.surroundings), *inner):
         if not kind.__module__.startswith("echelon."):
             raise Unsupported(f"the member `{kind.__name__}` of your own ({place_of(kind)})")
 
@@ -91,27 +80,24 @@ class _Traces:
         self.late = isinstance(network, LateNetwork)
         self.needs_packet = isinstance(network, LateNetwork) and network.rules.content.needs_packet
         self.senders, self.width = senders_of(own), sum(self.sizes.values())
-        self.n = len(self.loop.model.state_names)
+        # The form of the memory, known once it has begun.
+        self.like: PyTree = None
 
     def all(self) -> Iterator[LawFunction]:
         """Yield all functions that the agent needs."""
-        begin = _function(
-            "begin",
-            "the memory of an agent that begins at x",
-            lambda x: (_flat(begin_alone(self.loop, x)),),
-            ("memory",),
-            {"x": self.n},
-            self.bits,
-        )
-        yield begin
-        rows = len(self.senders) * self.width
-        sizes = {"t": None, "x": self.n, "received": rows, "memory": len(begin.results)}
+        sizes: dict[str, int | None] = {"x": len(self.loop.model.state_names)}
+        [memory] = _lowered(self._begin, sizes, self.bits)
+        about = "the memory of an agent that begins at x"
+        yield _function("begin", about, sizes, {"memory": memory})
+        rows = {"received": len(self.senders) * self.width, "memory": len(memory)}
+        sizes = {"t": None, **sizes, **rows}
+        u, memory, message, finite, hello, said = _lowered(self._step, sizes, self.bits)
         if not self.late:
             about = "its message at t (s) before it acts, whose feed-forward is NaN"
-            yield _function("speak", about, self._speak, ("message",), sizes, self.bits)
+            yield _function("speak", about, sizes, {"message": hello}, said)
         about = "a step at t (s) with the last message of each sender, NaN for none"
-        outputs = "u", "memory", "message"
-        yield _function("step", about, self._step, outputs, sizes, self.bits)
+        outputs = {"u": u, "memory": memory, "message": message}
+        yield _function("step", about, sizes, outputs, finite)
         yield from self._conversions()
 
     def _conversions(self) -> Iterator[LawFunction]:
@@ -122,37 +108,34 @@ class _Traces:
         pairs = ("physical", "u", v, model.physical), ("normalized", v, "u", model.normalized)
         for name, result, given, convert in pairs:
             words = "u of normalized inputs v" if given == v else "v of physical inputs u"
-            text, one = f"the {name} inputs {words}{about}", lambda x, f=convert: (f(x),)
-            yield _function(name, text, one, (result,), {given: m}, self.bits)
+            [numbers] = _lowered(lambda x, f=convert: f(x), {given: m}, self.bits)
+            text = f"the {name} inputs {words}{about}"
+            yield _function(name, text, {given: m}, {result: numbers})
 
-    def _acted(
+    def _begin(self, x: State) -> jax.Array:
+        memory = begin_alone(self.loop, x)
+        self.like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), memory)
+        return _flat(memory)
+
+    def _step(
         self, t: jax.Array, x: State, received: jax.Array, flat: jax.Array
-    ) -> tuple[Control, OwnMemory]:
+    ) -> tuple[jax.Array, ...]:
+        """Return inputs, memory, message, what is finite, and the same before the agent acts."""
         loop = after_mail(self.loop, self._arrived(received))
-        like = jax.eval_shape(lambda: begin_alone(loop, x))
-        return step_alone(loop, _unflat(like, flat), t, x)
-
-    def _speak(self, *rows: jax.Array) -> tuple[jax.Array, ...]:
-        said, near = self._said(self._acted(*rows)[0])
-        return jnp.concatenate([said, jnp.full(self.sizes["feed_forward"], jnp.nan), near]), said
-
-    def _step(self, t: jax.Array, *rows: jax.Array) -> tuple[jax.Array, ...]:
-        acted, after = self._acted(t, *rows)
-        said, near = self._said(acted)
-        parts = [said, acted.message[0], near]
+        acted, after = step_alone(loop, _unflat(self.like, flat), t, x)
+        said, near = acted.said[0], _flat(acted.memory.near)
+        message = _flat([said, acted.message[0], near])
+        hello = _flat([said, jnp.full(acted.message.shape[1], jnp.nan), near])
         if self.late:
             sent: Messages = jax.tree.map(lambda row: row[0], acted.memory.network[0])
             leader, stamp, content, term = sent.packet
             none = stamp == NEVER
-            head = [jnp.where(none, jnp.nan, t) if self.needs_packet else t, sent.hops]
             packet = [leader, stamp, content, *jax.tree.leaves(term)]
             packet = [jnp.where(none, jnp.nan, part) for part in packet]
-            parts = [*head, sent.value, *packet, near]
-        message = _flat([jnp.asarray(part, t.dtype) for part in parts])
-        return acted.inputs[0], _flat(after), message, _flat(_floats((rows[0], acted)))
-
-    def _said(self, acted: Control) -> tuple[jax.Array, jax.Array]:
-        return acted.said[0], _flat(acted.memory.near)
+            time = jnp.where(none, jnp.nan, t) if self.needs_packet else t
+            message = _flat([time, sent.hops, sent.value, packet, near])
+        finite = [x for x in jax.tree.leaves((x, acted)) if jnp.issubdtype(x.dtype, jnp.inexact)]
+        return acted.inputs[0], _flat(after), message, _flat(finite), hello, _flat([said, near])
 
     def _arrived(self, received: jax.Array) -> Arrived:
         """Return what messages contain, a row of each sender."""
@@ -192,10 +175,6 @@ def _whole(numbers: jax.Array, otherwise: int = NOBODY) -> jax.Array:
     return jnp.clip(numbers, 0.0, float(NOBODY)).astype(jnp.int32)
 
 
-def _floats(tree: PyTree) -> list[jax.Array]:
-    return [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.inexact)]
-
-
 def _flat(tree: PyTree) -> jax.Array:
     leaves = [jnp.ravel(leaf) for leaf in jax.tree.leaves(tree)]
     return jnp.concatenate([jnp.zeros(0), *(leaf.astype(float) for leaf in leaves)])
@@ -214,29 +193,37 @@ def _unflat(like: PyTree, flat: jax.Array) -> PyTree:
 # ---- a function of numbers -----------------------------------------------------------------------
 
 
-def _function(
-    name: str,
-    about: str,
-    compute: Callable[..., PyTree],
-    outputs: tuple[str, ...],
-    sizes: Mapping[str, int | None],
-    bits: int = 64,
-) -> LawFunction:
-    """Return a function; what `compute` returns after its outputs is finite where it is valid."""
+def _lowered(
+    compute: Callable[..., PyTree], sizes: Mapping[str, int | None], bits: int = 64
+) -> list[list[Node]]:
+    """Return the results of a function of arguments by name; None is the size of a number."""
     graph = ScalarGraph(bits, loops=True)
     leaves = [
         np.array(graph.leaf(key) if size is None else [graph.leaf(key, k) for k in range(size)])
         for key, size in sizes.items()
     ]
-    leaves = [np.asarray(leaf, object) for leaf in leaves]
-    parts = [nodes(graph, part) for part in lower(compute, graph, leaves)]
-    exceptions = graph.exceptions_of(sum(parts, start=[]))
-    plain = rewritten(sum(parts, start=exceptions), _plainer)
-    parts = [[plain[node] for node in part] for part in parts]
-    named = dict(zip(outputs, parts, strict=False))
-    if len(parts) == len(outputs):
+    results = lower(compute, graph, [np.asarray(leaf, object) for leaf in leaves])
+    return [nodes(graph, part) for part in results]
+
+
+def _function(
+    name: str,
+    about: str,
+    sizes: Mapping[str, int | None],
+    outputs: Mapping[str, list[Node]],
+    finite: Sequence[Node] = (),
+) -> LawFunction:
+    """Return a function, which is valid where some numbers are finite; always without any."""
+    results = sum(outputs.values(), start=[*finite])
+    graph = results[0].graph
+    exceptions = graph.exceptions_of(results)
+    plain = rewritten([*results, *exceptions], _plainer)
+    named = {key: [plain[node] for node in part] for key, part in outputs.items()}
+    if not finite:
         return LawFunction(name, about, sizes, named)
-    valid = _all_finite(graph, parts[-1])
+    # Their sum is finite where they are: one operation for each.
+    total = functools.reduce(operator.add, dict.fromkeys(plain[node] for node in finite))
+    valid = graph.make("lt", graph.make("abs", total), math.inf)
     for truth in _fewer([plain[truth] for truth in exceptions]):
         valid = graph.make("and", valid, graph.make("not", truth))
     return LawFunction(name, about, sizes, named, valid)
@@ -254,12 +241,6 @@ def _plainer(node: Node, args: Sequence[Node]) -> Node | bool | None:
             beyond = (bound, x) if node.op == "min" else (x, bound)
             return node.graph.make("select", node.graph.make("lt", *beyond), bound, x)
     return None
-
-
-def _all_finite(graph: ScalarGraph, numbers: Sequence[Node]) -> Node:
-    """Return whether numbers are finite, as their sum then is: one operation for each."""
-    total = functools.reduce(operator.add, dict.fromkeys(numbers))
-    return graph.make("lt", graph.make("abs", total), math.inf)
 
 
 def _fewer(truths: Sequence[Node]) -> list[Node]:
@@ -292,7 +273,8 @@ def move_function(motion: PlantStep) -> LawFunction:
 
     sizes = {"x": n, "u": m, "memory": m if remembers else 0, "push": n}
     about = "the state and what the actuators remember, a step later"
-    return _function("move", about, move, ("x", "memory"), sizes)
+    x, memory = _lowered(move, sizes)
+    return _function("move", about, sizes, {"x": x, "memory": memory})
 
 
 def motions_of(motion: PlantStep, agents: int, substeps: int) -> list[PlantStep]:
