@@ -1,17 +1,20 @@
 """Agents under exported laws in plain Python, beside `Agent`: the same messages, the same steps."""
 
+import itertools
 import math
 import types
 
-import jax
 import numpy as np
 
 import echelon as ech
-from echelon.output.archive.flight_folder import network_facts
-from echelon.simulation.onboard.law_functions import law_functions
+from echelon.agents.network.inbox import LeaderPacket, NamedValues
+from echelon.simulation.engine.agent import hull_names
+from echelon.simulation.onboard.agent_functions import agent_functions, message_sizes, senders_of
 from echelon.simulation.onboard.source_code import python_text
-from echelon_flight.pilot import NOBODY, Letterbox, Pilot, TickResult
-from echelon_flight.wire import LeaderPacket, Message
+from echelon.simulation.step.leadership import NOBODY
+from echelon_flight.pilot import Pilot
+
+EPS = np.finfo(float).eps
 
 
 def as_python(functions, folder=None):
@@ -20,156 +23,159 @@ def as_python(functions, folder=None):
     return {f.name: scope[f.name] for f in functions}
 
 
-def receive(agent, draws):
+class PlainAgent:
+    """An exported law with what its user has to do: keep the last message of each sender."""
+
+    def __init__(self, own, law):
+        self.own, self.law, self.memory = own, law, None
+        self.sizes, self.senders = message_sizes(own), senders_of(own)
+        self.rows = dict.fromkeys(self.senders, [math.nan] * sum(self.sizes.values()))
+
+    def row(self, message, before=None):
+        """The numbers of a message; what it lacks is as it was before."""
+        own, packet, sizes = self.own, message.packet, self.sizes
+        parts = {"signal": named(message.signal, own.signal_names)}
+        if "time" in sizes:
+            parts |= {"time": [message.time], "hops": [message.hops]}
+            if packet is not None:
+                parts |= {"leader": [packet.leader], "said": [packet.time], "term": [packet.term]}
+                parts |= {"content": packet.content}
+        if message.feedforward is not None:
+            parts |= {"feed_forward": named(message.feedforward, own.forward_names)}
+        if message.hull is not None:
+            parts |= {"hull": message.hull.values}
+        row = [*(before or [math.nan] * sum(sizes.values()))]
+        for begin, (name, size) in zip(
+            itertools.accumulate(sizes.values(), initial=0), sizes.items()
+        ):
+            if name in parts:
+                row[begin : begin + size] = map(float, parts[name])
+        return row
+
+    def receive(self, message):
+        self.rows[message.sender] = self.row(message, self.rows[message.sender])
+
+    def inputs(self, t, x):
+        memory = self.law["begin"](x) if self.memory is None else self.memory
+        return t, x, sum(self.rows.values(), []), memory
+
+    def speak(self, t, x):
+        message, valid = self.law["speak"](*self.inputs(t, x))
+        assert valid
+        return message
+
+    def step(self, t, x):
+        u, after, message, valid = self.law["step"](*self.inputs(t, x))
+        self.memory = after if valid else self.memory
+        return u, message, valid
+
+
+def pilot_of(agent, backups=()):
+    """A pilot with the exported law of an agent."""
     own = agent.own_law
-    names, forward_names = own.signal_names, own.forward_names
-    signals = [0.3 * draws.normal(size=len(names)) for _ in own.neighbours]
-    forward = 0.1 * draws.normal(size=len(forward_names))
-    sent = ech.Message(own.source, (names, np.zeros(len(names))), (forward_names, forward))
-    if own.source is None:
-        forward = forward * math.nan
-    else:
-        assert str(agent.receive(sent)) == "taken"
-    for sender, signal in zip(own.neighbours, signals, strict=True):
-        feed = (forward_names, forward) if sender == own.source else None
-        assert str(agent.receive(ech.Message(sender, (names, signal), feed))) == "taken"
-    return signals, forward
+    facts = {"agent": agent.number, "leads": own.leads, "hears": senders_of(own)}
+    facts |= {"message": message_sizes(own), "network": {"leaders": own.loop.laws.leaders.tolist()}}
+    law = types.SimpleNamespace(**as_python(agent_functions(own).values()))
+    return Pilot(law, facts, backups)
 
 
-def compare(agent, runs, steps, dt, size=0.1, terms=1.0):
+def named(part, names):
+    values = dict(zip(part[0], np.asarray(part[1]).tolist(), strict=True))
+    return [values.get(name, math.nan) for name in names]
+
+
+class Draws:
+    """Random states of one agent, and random messages for it."""
+
+    def __init__(self, agent, size=0.1, seed=0):
+        self.own, self.draws, self.size = agent.own_law, np.random.default_rng(seed), size
+        self.sizes, self.senders = message_sizes(self.own), senders_of(self.own)
+        self.hull_names = hull_names(self.own)
+        self.trim = np.array(self.own.loop.model.trim[0], float)
+
+    def state(self, k):
+        return self.trim + self.size * self.draws.normal(size=len(self.trim)) * (k > 0)
+
+    def messages(self, k, t):
+        if "time" not in self.sizes:
+            yield from map(self.ideal, self.senders)
+            return
+        for sender in self.senders:
+            # Lost or late, some for long, and none at first.
+            if k > 5 and (k // 60) % 3 != 2 and self.draws.random() < 0.3:
+                yield self.late(sender, max(0.0, t - self.draws.uniform(0.0, 0.3)))
+
+    def normal(self, names, size):
+        return NamedValues(tuple(names), size * self.draws.normal(size=len(names)))
+
+    def hull(self, sender):
+        """Points about a place of each sender, that is near the agent's own at times."""
+        if not self.hull_names:
+            return None
+        d = len(self.own.loop.model.position)
+        place = self.draws.normal(size=d) + np.resize([0.3 * sender, 0.3], d)
+        points = place + 0.1 * self.draws.normal(size=(len(self.hull_names) // d, d))
+        return NamedValues(self.hull_names, points.ravel())
+
+    def ideal(self, sender):
+        own = self.own
+        forward = self.normal(own.forward_names, 0.1) if sender == own.source else None
+        signal = self.normal(own.signal_names, 0.3)
+        return ech.Message(sender, signal, forward, hull=self.hull(sender))
+
+    def late(self, sender, time):
+        own, draws = self.own, self.draws
+        signal, hops = self.normal(own.signal_names, 0.2), int(draws.choice([0, 1, 2, NOBODY]))
+        said = 0.1 * draws.normal(size=self.sizes["content"])
+        units = np.abs(np.diag(own.loop.model.input_scale))
+        inputs = len(own.signal_names) + len(own.forward_names)
+        # In the vehicle's units: a torque of .1 N m would turn it by 10^4 rad/s^2.
+        if len(said) >= inputs + len(units):
+            said[inputs : inputs + len(units)] *= units
+        # A leader says one thing at a time: two packets of one time would be the same.
+        leader = int(own.loop.laws.leaders[0])
+        packet = LeaderPacket(leader, time - draws.uniform(0.0, 0.9), tuple(said.tolist()))
+        return ech.Message(sender, signal, None, time, hops, packet, self.hull(sender))
+
+
+def compare(agent, laws, steps, dt, size=0.1, terms=1.0):
     """Let an agent and copies of its law take the same random steps; returns their memories.
 
     Args:
-        agent: in the ideal network.
-        runs: functions by name, of each copy.
+        agent: in any network.
+        laws: functions by name, of each copy.
         steps: how many.
         dt: between two, s; the law's own, or longer to see more of its time.
         size: of the random states.
         terms: the largest of which a number of the step is the sum.
     """
-    own, draws = agent.own_law, np.random.default_rng(0)
-    trim = np.array(own.loop.model.trim[0], float)
-    memories = [run["begin"](trim.tolist()) for run in runs]
+    draws, plain, sent = Draws(agent, size), [PlainAgent(agent.own_law, law) for law in laws], 0
     for k in range(steps):
-        x, time = trim + size * draws.normal(size=len(trim)) * (k > 0), k * dt
-        signals, forward = receive(agent, draws)
-        u, message = agent.step(time, x)
-        memory = agent._now.memory.laws[not own.leads]
-        leaves = [np.ravel(leaf[0]) for leaf in jax.tree.leaves(memory)]
-        flat = np.concatenate([np.zeros(0), *leaves])
-        expected = u, flat, message.signal.values, message.feedforward.values
-        row = 0 if own.schedule is None else own.schedule.row(time)
-        for number, run in enumerate(runs):
-            before = memories[number]
-            gaps = [run["difference"](time, x.tolist(), before, s.tolist()) for s in signals]
-            z = own.weights[row] @ np.array(gaps) if gaps else np.zeros(len(own.signal_names))
-            inputs = time, x.tolist(), z.tolist(), forward.tolist(), before
-            *results, valid = run["tick"](*inputs)
-            memories[number] = results[1]
-            assert valid and run["signal"](time, x.tolist(), before) == results[2]
-            # All but the input are sums of terms as large as the largest number of the step.
-            largest = max(1.0, *(np.abs(value).max(initial=0.0) for value in expected))
-            scales = max(1.0, np.abs(u).max()), largest, largest, largest
-            for got, value, scale in zip(results, expected, scales, strict=True):
-                atol = max(1e-14 * scale, 4.0 * np.finfo(float).eps * terms)
-                np.testing.assert_allclose(got, value, rtol=0, atol=atol)
-    return memories
-
-
-def pilot_of(agent, dt, **options):
-    """A pilot with the exported law of an agent, and the facts that it is given."""
-    own = agent.own_law
-    functions = law_functions(own)
-    facts = {
-        "agent": agent.number,
-        "dt": dt,
-        "leads": own.leads,
-        "hears": list(own.neighbours),
-        "weights": own.weights[0].tolist(),
-        "signal": own.signal_names,
-        "message": own.forward_names,
-        "network": network_facts(own, dt, functions),
-    }
-    law = types.SimpleNamespace(**as_python(functions.values()))
-    states = facts["network"]["messages"] == "state"
-    return (StatePilot if states else Pilot)(law, facts, **options), facts
-
-
-class StatePilot:
-    """A follower that hears leaderward, over a network whose messages contain states.
-
-    Pilots refuse such messages; docs/onboard.md has the rules.
-    """
-
-    def __init__(self, law, facts):
-        assert facts["network"]["uses"] == "leaderward" and not facts["leads"]
-        self.law, self.facts, self.memory = law, facts, None
-        self.box = Letterbox(facts["hears"], facts["network"]["leaders"], None)
-
-    def tick(self, t, x):
-        law, facts, letters = self.law, self.facts, [*self.box.letters.values()]
-        memory = law.begin(x) if self.memory is None else self.memory
-        forget, agents = facts["network"]["forget_hops"], facts["network"]["agents"]
-        hops = min((m.hops for m in letters if m and t - m.time <= forget), default=NOBODY) + 1
-        hops = hops if hops < agents else NOBODY
-        used = [(w, m) for w, m in zip(facts["weights"], letters) if m and m.hops < hops]
-        gaps = [np.multiply(w, law.difference(t, x, memory, m.value)) for w, m in used]
-        z = sum(gaps, np.zeros(len(facts["signal"]))) / (sum(w for w, _ in used) or 1.0)
-        packet = self.box.packet
-        forward = [0.0] * len(facts["message"]) if packet is None else list(packet.content)
-        u, after, signal, _, valid = law.tick(t, x, z.tolist(), forward, memory)
-        self.memory = after
-        return TickResult(u, Message(facts["agent"], t, hops, tuple(signal), packet), valid)
-
-
-def compare_late(agent, dt, steps, size=0.1):
-    """Let an agent and a pilot with its law take the same steps on the same random messages."""
-    own, draws = agent.own_law, np.random.default_rng(1)
-    pilot, facts = pilot_of(agent, dt)
-    trim, sent = np.array(own.loop.model.trim[0], float), 0
-    for k in range(steps):
-        t = k * dt
-        for sender in own.neighbours:
-            # Lost or late, some for long, and none at first.
-            if k > 5 and (k // 60) % 3 != 2 and draws.random() < 0.3:
-                time = max(0.0, t - draws.uniform(0.0, 0.3))
-                letter = draw_letter(own, facts, sender, time, draws)
-                answer = agent.receive(as_message(letter, own.signal_names))
-                assert (pilot.box.receive(letter, t) is None) == (str(answer) == "taken")
-        x = trim + size * draws.normal(size=len(trim))
+        t, x = k * dt, draws.state(k)
+        for message in draws.messages(k, t):
+            if str(agent.receive(message)) == "taken":
+                for one in plain:
+                    one.receive(message)
+        if "speak" in laws[0]:
+            hello = agent.hello(x, t)
+            for one in plain:
+                check(one.speak(t, x.tolist()), one.row(hello), terms=terms)
         u, message = agent.step(t, x)
-        ours, letter, valid = pilot.tick(t, x.tolist())
-        # The input is a sum of terms as large as the own deviation.
-        terms = [*u, *([] if message is None else message.signal.values)]
-        np.testing.assert_allclose(ours, u, rtol=0, atol=1e-13 * max(1.0, np.abs(terms).max()))
-        assert valid and (message is None) == (letter is None)
-        if message is not None:
-            sent += 1
-            assert letter.hops == min(message.hops, NOBODY) and letter.time == message.time
-            np.testing.assert_allclose(letter.value, message.signal.values, rtol=0, atol=1e-12)
-            if letter.packet is not None:
-                content = message.packet.content
-                assert letter.packet[:2] == message.packet[:2]
-                np.testing.assert_allclose(letter.packet.content, content, rtol=0, atol=1e-12)
+        sent += message is not None
+        for one in plain:
+            ours, numbers, valid = one.step(t, x.tolist())
+            assert valid and (message is None) == math.isnan(numbers[0]), (k, t)
+            if message is not None:
+                check(numbers, one.row(message), terms=terms)
+            # The input is a sum of terms as large as the own deviation.
+            off = [] if message is None or "time" not in draws.sizes else message.signal.values
+            check(ours, u, max([1.0, *np.abs(off)]), terms)
     assert sent > steps // 2
+    return [one.memory for one in plain]
 
 
-def draw_letter(own, facts, sender, time, draws):
-    network = facts["network"]
-    values = 0.2 * draws.normal(size=len(own.signal_names))
-    hops = int(draws.choice([0, 1, 2, NOBODY]))
-    said = 0.1 * draws.normal(size=network["content"])
-    if network["prediction"] == "packet":
-        # In the vehicle's units: a torque of .1 N m would turn it by 10^4 rad/s^2.
-        units = np.abs(np.diag(own.loop.model.input_scale))
-        said[-len(units) :] *= units
-    said = tuple(said.tolist())
-    # A leader says one thing at a time: two packets of one time would be the same.
-    packet = LeaderPacket(network["leaders"][0], time - draws.uniform(0.0, 0.9), said)
-    return Message(sender, time, hops, tuple(values.tolist()), packet)
-
-
-def as_message(letter, names):
-    hops = 2**30 if letter.hops == NOBODY else letter.hops
-    signal = names, letter.value
-    return ech.Message(letter.sender, signal, None, letter.time, hops, letter.packet)
+def check(got, expected, largest=1.0, terms=1.0):
+    """Compare numbers to 1e-14 of the largest; whole numbers, times and NaN are the same."""
+    sizes = np.abs([x for x in expected if abs(x) < NOBODY])
+    atol = max(1e-14 * sizes.max(initial=largest), 4.0 * EPS * terms)
+    np.testing.assert_allclose(got, expected, rtol=0, atol=atol)

@@ -14,8 +14,7 @@ from echelon.output.archive.flight_folder import law_files
 
 ALONE = """
 import law
-memory = law.begin({x})
-u, memory, signal, message, valid = law.tick(0.0, {x}, [0.0] * {n}, [0.0] * {k}, memory)
+u, memory, message, valid = law.step(0.0, {x}, {received}, law.begin({x}))
 assert valid and law.AGENT == 1 and law.DT == 0.01
 print(u)
 """
@@ -31,9 +30,7 @@ def test_the_files_state_whom_an_agent_hears_and_run_without_echelon(tmp_path, e
     stated = json.loads((out / "law.json").read_text("utf-8"))
     parts, settings = ech.build(ech.load_scenario("integrators", ["simulation.dt=0.01"]))
     agent = ech.Agent(parts, 1, 0.01)
-    assert stated["hears"] == list(agent.neighbours) and len(stated["weights"]) == len(
-        agent.neighbours
-    )
+    assert stated["hears"] == list(agent.neighbours) and 0 in agent.neighbours
     whole = ech.guarantee(parts, settings).as_mapping()
     assert stated["guarantee"]["verdict"] == "guaranteed"
     assert stated["guarantee"].pop("while") == stated["guarantee"].pop("against") == []
@@ -41,7 +38,8 @@ def test_the_files_state_whom_an_agent_hears_and_run_without_echelon(tmp_path, e
     for name, digest in stated["sha256"].items():
         assert hashlib.sha256((out / name).read_bytes()).hexdigest() == digest
     x = [0.5] * len(stated["states"])
-    text = ALONE.format(x=x, n=len(stated["signal"]), k=len(stated["message"]))
+    received = [0.0] * len(stated["hears"]) * sum(stated["message"].values())
+    text = ALONE.format(x=x, received=received)
     # -S: no packages, of which echelon is one.
     done = subprocess.run(
         [sys.executable, "-S", "-c", text], cwd=out, capture_output=True, text=True
@@ -61,11 +59,6 @@ def test_what_cannot_be_exported_is_refused_in_one_sentence(tmp_path, echelon):
     code, _, errors = echelon("export", "integrators", "--agent", 99, "--out", tmp_path / "law")
     assert code == 2 and "agent 99 is not in this graph" in errors and errors.count("\n") == 1
     assert not (tmp_path / "law").exists()
-    code, _, errors = echelon("export", "crossing", "--agent", 1, "--out", tmp_path / "law")
-    assert code == 2 and errors == (
-        "echelon: the law of agent 1 cannot be exported: there is no code for agents that keep "
-        "away from each other.\n"
-    )
     (tmp_path / "mine").write_text("")
     code, _, errors = echelon("export", "integrators", "--agent", 1, "--out", tmp_path)
     assert code == 2 and "is not empty" in errors

@@ -1,5 +1,7 @@
 """Whole flights of exported laws, in this process under a clock that tests move."""
 
+import math
+
 import pytest
 from virtual_flight import LinkImpairment, VirtualFlight
 
@@ -51,3 +53,33 @@ def test_a_formation_is_kept_over_a_radio_and_by_who_comes_back(folder, tmp_path
     assert max(row[1] for row in errors[killed:]) < 0.01
     flight.wait(lambda state: len(flight.ended) == 3)
     assert set(flight.ended.values()) == {Fault.END}
+
+
+@pytest.mark.slow
+def test_agents_that_keep_apart_in_a_run_do_so_in_a_flight(tmp_path, monkeypatch):
+    """Two followers begin at each other's places, with the leader between them."""
+    graph = ech.Graph([(0, 1), (0, 2)], directed=True)
+    places = ech.Formation.from_offsets(CARTS, graph, {1: (1.0, 0.0), 2: (-1.0, 0.0)})
+    safety = ech.Safety(radii=(0.15, 0.15, 0.15))
+    hover = ech.references.Hover(position=(0.0, 0.0, 0.0))
+    starts = [[0.0, 0.0, 0.0, 0.0], [-1.0, 0.05, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]]
+    least = {}
+    for law in (ech.laws.StoppingPoint(), ech.laws.StoppingPoint(safety=safety)):
+        drive = ech.Laws(ech.laws.StoppingLeader(reference=hover), law)
+        world = ech.World(network=ech.Network(rate=25.0))
+        parts = ech.Parts(CARTS, graph, places, drive, initial=starts, world=world)
+        out = tmp_path / f"{law.safety is None}"
+        save_flight(flight_files(parts, ech.Settings(horizon=SECONDS, dt=DT), "apart"), out)
+        flight = VirtualFlight(out, tmp_path / "key", monkeypatch)
+        for k in range(3):
+            flight.start_agent(k)
+        flight.take_off(0, 1, 2)
+        gaps = []
+        while not flight.ended and (not gaps or flight.time < SECONDS - 0.1):
+            flight.fly(DT)
+            x = [vehicle.x[:2] for vehicle in flight.vehicles]
+            gaps.append(min(math.dist(x[i], x[j]) for i, j in ((0, 1), (0, 2), (1, 2))))
+        least[law.safety is None] = min(gaps)
+        assert max(place_errors(flight.mission.facts, SECONDS, x)) < 0.02
+    # Without it the two pass through each other.
+    assert least[True] < 0.1 and least[False] > safety.touching

@@ -1,23 +1,19 @@
-"""The letterbox follows the rules of simulated messages: both receive the same letters."""
+"""The letterbox takes and keeps what the inbox of `Agent` does: both receive the same letters."""
 
 import math
 import random
 
-import jax
-import jax.numpy as jnp
 import numpy as np
+import pytest
 
-from echelon.agents.network.channel import NEVER, Network
-from echelon.agents.network.exchange import Exchange
-from echelon.agents.network.inbox import LateInbox, Message, NamedValues, Received
-from echelon.simulation.step.leadership import FixedLeaders
-from echelon.simulation.step.networks import MessageRules
-from echelon.simulation.step.records import LeaderPackets, Messages
+from echelon.agents.network.inbox import LateInbox, LeaderPacket, Message, NamedValues, Received
 from echelon_flight import wire
 from echelon_flight.pilot import Letterbox
-from echelon_flight.wire import Drop, LeaderPacket
+from echelon_flight.wire import Drop
 
 HEARS, LEADERS, NAMES = (0, 1, 3), (0, 1), ("x", "y")
+PARTS = {"time": 1, "hops": 1, "signal": 2, "leader": 1, "said": 1, "content": 2}
+FACTS = {"hears": HEARS, "message": PARTS, "network": {"leaders": LEADERS}}
 SAME = {
     None: Received.TAKEN,
     Drop.SENDER: Received.NOT_HEARD,
@@ -30,56 +26,51 @@ SAME = {
 def draw(draws, clock):
     time = clock + draws.choice((draws.uniform(-2.0, 0.2), -0.5, 0.0))
     said = time + draws.choice((draws.uniform(-1.0, 0.2), -0.25))
-    leader = draws.choice((0, 0, 1, 2))
-    # A leader says one thing at a time.
-    packet = LeaderPacket(leader, said, (math.sin(said), float(leader)))
-    packet = draws.choice((packet, packet, packet, packet._replace(term=1), None))
-    value = draws.random(), draws.random()
-    return wire.Message(
-        draws.choice((0, 1, 2, 3)), time, draws.choice((0, 1, 2, 0xFFFF)), value, packet
-    )
+    leader, hops = draws.choice((0, 0, 1, 2)), draws.choice((0, 1, 2, 2**23))
+    row = time, hops, draws.random(), draws.random(), leader, said, math.sin(said), leader
+    return wire.Message(draws.choice((0, 1, 2, 3)), tuple(map(float, row)))
 
 
 def as_message(letter):
-    values = NamedValues(NAMES, np.array(letter.value))
-    return Message(letter.sender, values, None, letter.time, letter.hops, letter.packet)
+    time, hops, *value, leader, said = letter.row[:6]
+    packet = LeaderPacket(int(leader), said, letter.row[6:])
+    values = NamedValues(NAMES, np.array(value))
+    return Message(letter.sender, values, None, time, int(hops), packet)
 
 
 def test_both_take_and_keep_the_same():
-    links = Exchange(np.zeros(3, int), np.arange(3), np.ones(3))
-    for own in (None, 0, 1):
-        draws, answers = random.Random(f"{own}"), set()
-        box = Letterbox(HEARS, LEADERS, own)
-        inbox = LateInbox(HEARS, 0, NAMES, NAMES, LEADERS, 2, True, False)
-        leaders = FixedLeaders(np.array([own is not None]))
-        rules = MessageRules.of(Network().prepared(0.02, 1.0, 0), leaders, 4)
-        take = jax.jit(
-            lambda mail, sent, stamp: rules.take(mail, sent, stamp != NEVER, stamp, links)
-        )
-        with jax.enable_x64(True):
-            mail = rules.begin(jnp.array([2 if own is None else own]), 3, jnp.zeros((1, 2)), 2)
-            packet = mail.packet._replace(stamp=mail.packet.stamp.astype(float))
-            mail = mail._replace(stamp=mail.stamp.astype(float), packet=packet)
-        for k in range(1_000):
-            inbox.clock = clock = 0.01 * k
-            letter = draw(draws, clock)
-            why = box.receive(letter, clock)
-            answers.add(why)
-            assert SAME[why] is inbox.receive(as_message(letter)), letter
-            if why is not None:
+    draws, answers = random.Random(0), set()
+    box, inbox = Letterbox(FACTS), LateInbox(HEARS, 0, NAMES, NAMES, LEADERS, 2, True, False)
+    for k in range(2_000):
+        inbox.clock = clock = 0.01 * k
+        letter = draw(draws, clock)
+        why = box.receive(letter, clock)
+        answers.add(why)
+        expected = inbox.receive(as_message(letter))
+        # The inbox looks at a packet's leader before it looks at times.
+        assert SAME[why] is expected or {why, expected} == {Drop.AHEAD, Received.NO_MESSAGE}
+        for j, row in enumerate(np.reshape(box.rows, (len(HEARS), -1))):
+            if math.isnan(row[0]):
+                assert inbox.time[j] < -1e6 and np.isnan(row).all()
                 continue
-            kept = list(box.letters.values())
-            times = [NEVER if x is None else x.time for x in kept]
-            assert times == inbox.time.tolist()
-            assert [x.hops for x in kept if x] == [h for h in inbox.hops.tolist() if h < 2**30]
-            rows = [[math.nan] * 2 if x is None else x.value for x in kept]
-            np.testing.assert_array_equal(inbox.signals, rows)
-            packets = LeaderPackets(inbox.leader, inbox.said, inbox.content, ())
-            with jax.enable_x64(True):
-                mail = take(mail, Messages(inbox.signals, inbox.hops, packets), inbox.time)
-            said = jax.tree.map(lambda row: np.asarray(row)[0].tolist(), mail.packet)
-            # Its own packets come back to a leader, and say nothing new.
-            assert (box.packet is None) == (said.stamp == NEVER or said.leader == own)
-            assert box.packet is None or box.packet[:2] == (said.leader, said.stamp)
-            assert box.packet is None or list(box.packet.content) == said.content
-        assert answers == {*SAME}
+            packet = inbox.leader[j], inbox.said[j], *inbox.content[j]
+            kept = inbox.time[j], inbox.hops[j], *inbox.signals[j], *packet
+            np.testing.assert_array_equal(row, kept)
+    assert answers == {*SAME}
+
+
+@pytest.mark.parametrize(("leader", "term", "taken"), [
+    *[(0, 0.0, True), (0, 1.0, False), (1, 0.0, False), (1, 1.0, True), (1, 7.0, True)],
+    *[(1, 0.5, False), (1, -1.0, False), (2, 1.0, False)],
+])  # fmt: skip
+def test_a_later_term_is_of_a_backup_leader_and_of_nobody_else(leader, term, taken):
+    facts = FACTS | {"message": PARTS | {"term": 1}}
+    box = Letterbox(facts, backups=[1])
+    row = 1.0, 1.0, 0.0, 0.0, float(leader), 0.9, 0.0, 0.0, term
+    assert (box.receive(wire.Message(3, row), 1.0) is None) == taken
+
+
+def test_ages_are_those_of_the_newest_letters():
+    box, row = Letterbox(FACTS), (1.0, 1.0, 0.0, 0.0, 0.0, 0.9, 0.0, 0.0)
+    assert box.receive(wire.Message(1, row), 1.0) is None
+    assert box.ages(1.5) == [math.inf, 0.5, math.inf]

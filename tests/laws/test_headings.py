@@ -2,25 +2,23 @@
 
 import json
 import math
-import types
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from in_words import in_words
 from model_family import MODELS
-from plain_agents import as_python
+from plain_agents import PlainAgent, as_python, pilot_of
 
 import echelon as ech
 from echelon.agents.models.chains import angles_among
 from echelon.agents.models.model import wrap_angles
-from echelon.output.archive.flight_folder import network_facts, python_law
-from echelon.simulation.onboard.law_functions import law_functions
-from echelon.simulation.onboard.source_code import python_text
+from echelon.agents.network.inbox import LeaderPacket
+from echelon.output.archive.flight_folder import python_law
+from echelon.simulation.onboard.agent_functions import agent_functions
 from echelon.synthesis.gains import FixedGain
 from echelon.synthesis.gains.gain import synthesize
-from echelon_flight.pilot import Pilot
-from echelon_flight.wire import LeaderPacket, Message
+from echelon_flight import wire
 
 TURN = 2.0 * math.pi
 PATH = ech.Graph.path(3)
@@ -60,7 +58,7 @@ def stopping(model, graph=PATH, reference=None, network=None, law=None, **more):
 def plain_law(parts, agent, dt=0.01):
     """The exported law of an agent in Python."""
     own = ech.Agent(parts, agent, dt).own_law
-    return types.SimpleNamespace(**as_python(law_functions(own).values())), own
+    return PlainAgent(own, as_python(agent_functions(own).values()))
 
 
 def facing(model, yaw, place=0.0):
@@ -108,14 +106,13 @@ CASES += [pytest.param(name, "stopping-point", marks=SLOW.get(name, ())) for nam
 def test_one_heading_written_in_several_ways_gives_one_input(name, law):
     """The law of an agent, as exported in Python; of unicycles no chain has the heading."""
     model = MODELS[name]
-    plain, own = plain_law(under(law, model), 1)
-    x = facing(model, 3.1)
-    other, inputs = plain.signal(0.0, x, plain.begin(x)), []
+    plain, inputs = plain_law(under(law, model), 1), []
+    other = plain.speak(0.0, facing(model, 3.1))
+    other = [0.0 if math.isnan(number) else number for number in other]
+    plain.rows = dict.fromkeys(plain.rows, other)
     for turns in (0, 1, -1, 5):
-        x = facing(model, 3.0 + turns * TURN)
-        memory = plain.begin(x)
-        z = plain.difference(0.0, x, memory, other)
-        inputs.append(plain.tick(0.0, x, z, [0.0] * len(own.forward_names), memory)[0])
+        plain.memory = None
+        inputs.append(plain.step(0.0, facing(model, 3.0 + turns * TURN))[0])
     assert np.abs(np.array(inputs[0]) - model.trim[1]).max() > 0.0
     np.testing.assert_allclose(inputs, [inputs[0]] * 4, rtol=1e-9, atol=1e-12)
 
@@ -123,14 +120,15 @@ def test_one_heading_written_in_several_ways_gives_one_input(name, law):
 @pytest.mark.parametrize("name", [pytest.param(n, marks=SLOW.get(n, ())) for n in CHAINED])
 def test_a_measured_heading_that_passes_pi_does_not_change_the_command(name):
     """Against the same measurements with the heading counted on; in the memory too."""
-    plain, own = plain_law(stopping(MODELS[name]), 1)
-    silence, flights = [0.0] * len(own.forward_names), []
+    plain, flights = plain_law(stopping(MODELS[name]), 1), []
     for measured in (lambda yaw: yaw, lambda yaw: math.remainder(yaw, TURN)):
-        memory, rows = plain.begin(facing(MODELS[name], 3.0)), []
+        plain.memory, rows = plain.law["begin"](facing(MODELS[name], 3.0)), []
         for k, yaw in enumerate(np.linspace(3.0, 9.6, 40)):
             x = facing(MODELS[name], measured(yaw))
-            u, memory, signal, *_ = plain.tick(0.01 * k, x, [0.1] * 4, silence, memory)
-            rows.append([*u, *memory, *signal])
+            said = [number - 0.1 for number in plain.speak(0.01 * k, x)[:4]]
+            plain.rows = dict.fromkeys(plain.rows, [*said, *[0.0] * 4])
+            u, message, _ = plain.step(0.01 * k, x)
+            rows.append([*u, *plain.memory, *message[:4]])
         flights.append(rows)
     assert flights[0][-1][-1] == pytest.approx(9.6)
     np.testing.assert_allclose(flights[1], flights[0], rtol=1e-9, atol=1e-9)
@@ -206,13 +204,10 @@ def test_a_process_that_begins_late_does_not_make_up_for_turns(by):
     names, heading = own.signal_names, [0.0, 0.0, t]
     packet = LeaderPacket(0, t - 0.02, (0.0, 0.0, 0.0))
     if by == "pilot":
-        functions, law = law_functions(own), types.ModuleType("law")
-        exec(python_text(functions.values(), "A law.", {}), vars(law))
-        facts = {"agent": 1, "dt": 0.02, "leads": False, "hears": list(own.neighbours)}
-        facts |= {"weights": own.weights[0].tolist(), "signal": names, "message": names}
-        pilot = Pilot(law, facts | {"network": network_facts(own, 0.02, functions)})
+        pilot = pilot_of(agent)
         for k in own.neighbours:
-            pilot.box.receive(Message(k, t - 0.02, k, (0.0, 0.0, 0.0), packet), t)
+            row = t - 0.02, float(k), 0.0, 0.0, 0.0, float(packet.leader), packet.time
+            pilot.box.receive(wire.Message(k, (*row, *packet.content)), t)
         u = pilot.tick(t, x).u
     else:
         if network is not None:  # which has no message before it
@@ -240,12 +235,14 @@ def test_what_is_guaranteed_of_a_start_is_that_of_its_nearest_turn():
 
 def test_a_follower_that_is_fed_with_the_leaders_input_turns_as_fast():
     model = MODELS["point"]
-    plain = [plain_law(under("consensus", model), k)[0] for k in (0, 1)]
+    leader, follower = (plain_law(under("consensus", model), k) for k in (0, 1))
     x = [3.0 + 0.1, 0.3, 1.57]
-    u, _, _, message, _ = plain[0].tick(0.0, x, [0.0] * 3, [0.0] * 3, plain[0].begin(x))
-    sent = [*plain[0].normalized(u), message[-1]]
+    u, message, _ = leader.step(0.0, x)
+    message = message[3:]
+    sent = [*leader.law["normalized"](u), message[-1]]
     np.testing.assert_allclose(sent, message, rtol=1e-12)
-    again = plain[1].tick(0.0, x, [0.0] * 3, sent, plain[1].begin(x))[0]
+    follower.rows[0] = [math.nan] * 3 + sent
+    again = follower.step(0.0, x)[0]
     np.testing.assert_allclose(again, u, rtol=1e-12)
     assert abs(u[1]) > 0.01 and u[1] != pytest.approx(message[1], rel=0.5)
 
@@ -253,11 +250,11 @@ def test_a_follower_that_is_fed_with_the_leaders_input_turns_as_fast():
 @pytest.mark.parametrize("name", ["point", "crazyflie", "attitude"])
 def test_inputs_are_the_trim_and_the_scale_times_normalized_ones(name):
     model = MODELS[name]
-    plain, _ = plain_law(under("consensus", model), 1)
+    law = plain_law(under("consensus", model), 1).law
     v = [0.3, -0.2, 0.5, 0.1][: len(model.input_names)]
     expected = np.array(model.trim[1]) + np.array(model.input_scale) @ v
-    np.testing.assert_allclose(plain.physical(v), expected, rtol=1e-12)
-    np.testing.assert_allclose(plain.normalized(expected.tolist()), v, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(law["physical"](v), expected, rtol=1e-12)
+    np.testing.assert_allclose(law["normalized"](expected.tolist()), v, rtol=1e-9, atol=1e-12)
 
 
 def test_law_json_names_no_message_as_an_input():
@@ -265,7 +262,7 @@ def test_law_json_names_no_message_as_an_input():
     stated = ech.guarantee(under("consensus", model), settings).as_mapping()
     files = python_law(under("consensus", model), settings, 1, "", stated)
     facts = json.loads(files["law.json"])
-    assert facts["message"] == ["normalized speed", "normalized turn_rate", "heading"]
-    assert "no physical inputs u" in facts["message_meaning"]
+    assert facts["feed_forward"] == ["normalized speed", "normalized turn_rate", "heading"]
+    assert "no physical inputs u" in facts["feed_forward_meaning"]
     np.testing.assert_allclose(facts["scale"], model.input_scale)
     assert "u = u* + S v, where u* is (0, 0) and S has the rows (1, 0; 0, " in files["law.py"]

@@ -7,16 +7,22 @@ import re
 import shutil
 import subprocess
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from plain_agents import as_python, compare
+from carts import carts
+from plain_agents import Draws, PlainAgent, as_python, compare
 
 import echelon as ech
+from echelon.agents.world.sensing import Sensors, SensorStage
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.onboard.law_functions import LawFunction, law_functions, move_function
-from echelon.simulation.onboard.source_code import c_text, header_text
-from echelon.simulation.scalars import ScalarGraph
+from echelon.simulation.onboard.agent_functions import agent_functions, move_function
+from echelon.simulation.onboard.source_code import LawFunction, c_text, header_text
+from echelon.simulation.scalars import ScalarGraph, Unsupported, lower, nodes
 from echelon.simulation.scalars.scalar_graph import OPERATIONS
+from echelon.simulation.step.loop import IdealNetwork
 
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang") or "cc"
 """Of the studies; the other tests read the text of C, which needs none."""
@@ -38,7 +44,9 @@ def as_read_c(functions, folder, bits=64):
 
 def read(line):
     """Return a line of C as one of Python."""
-    line = re.sub(r"^(    )?const (law_real|int) ", r"    ", line.rstrip(";"))
+    line = re.sub(r"^( *)(const )?(law_real|int) ", r"\1", line.rstrip(";"))
+    line = re.sub(r"^( *)for \(;;\) \{", r"\1while True:", line)
+    line = re.sub(r"^( *)\}$", "", line)
     line = re.sub(r"\(void\)\w+", "pass", line)
     line = re.sub(r"if \((.*)\)$", r"if \1:", line)
     line = re.sub(r" = (\S+) \? (.+) : (.+)$", r" = \2 if \1 else \3", line)
@@ -213,73 +221,151 @@ def agent(request):
 
 @all_ways
 def test_a_law_by_itself_steps_as_the_agent_does(agent, ways, tmp_path):
-    functions = law_functions(agent.own_law).values()
-    runs = [way(functions, tmp_path) for way in ways]
-    memories = compare(agent, runs, 300, agent.own_law.loop.motion.dt)
+    functions = agent_functions(agent.own_law).values()
+    laws = [way(functions, tmp_path) for way in ways]
+    memories = compare(agent, laws, 200, agent.own_law.loop.motion.dt)
     # Python and C agree to the bit.
     assert all(memory == memories[0] for memory in memories)
 
 
 @each_way
 def test_what_is_not_finite_is_not_valid(agent, way, tmp_path):
-    own, functions = agent.own_law, law_functions(agent.own_law).values()
+    own, functions = agent.own_law, agent_functions(agent.own_law).values()
     trim = list(map(float, own.loop.model.trim[0]))
-    sizes = {f.name: f.inputs for f in functions}["tick"]
-    run = way(functions, tmp_path)
-    zeros = {name: [0.0] * size for name, size in sizes.items() if size is not None}
-    rest = zeros | {"x": trim, "memory": run["begin"](trim)}
-    assert run["tick"](0.0, *rest.values())[-1]
+    plain = PlainAgent(own, way(functions, tmp_path))
+    assert plain.step(0.0, trim)[-1]
     for bad in (math.nan, math.inf, -math.inf):
-        wrong = rest | {"x": [*trim[:2], bad, *trim[3:]]}
-        assert not run["tick"](0.0, *wrong.values())[-1], bad
+        assert not plain.step(0.0, [*trim[:2], bad, *trim[3:]])[-1], bad
 
 
 def test_single_precision_is_that_of_its_own_trace(agent, tmp_path):
     """The text in single precision, evaluated by NumPy's own, against double precision."""
-    own, draws = agent.own_law, np.random.default_rng(2)
-    double, single = law_functions(own), law_functions(own, 32)
-    exact, rounded = as_python(double.values(), tmp_path), as_read_c(single.values(), tmp_path, 32)
-    trim = np.array(own.loop.model.trim[0])
-    sizes = single["tick"].inputs
-    memory = exact["begin"](trim.tolist())
+    own, draws = agent.own_law, Draws(agent, seed=2)
+    single = as_read_c(agent_functions(own, 32).values(), tmp_path, 32)
+    exact = PlainAgent(own, as_python(agent_functions(own).values()))
     for k in range(40):
-        x = (trim + 0.1 * draws.normal(size=len(trim))).tolist()
-        forward = (0.1 * draws.normal(size=sizes["feed_forward"])).tolist()
-        z = (0.3 * draws.normal(size=sizes["z"])).tolist()
-        rows = k * own.loop.motion.dt, x, z, forward, memory
-        *results, valid = exact["tick"](*rows)
-        *ours, fine = rounded["tick"](*rows)
+        t, x = k * own.loop.motion.dt, draws.state(k + 1).tolist()
+        for message in draws.messages(k, t):
+            exact.receive(message)
+        *ours, fine = single["step"](*exact.inputs(t, x))
+        *results, valid = exact.law["step"](*exact.inputs(t, x))
         assert valid and fine
         for got, value in zip(ours, results, strict=True):
-            size = max(1.0, np.abs(value).max(initial=0.0))
+            size = max(1.0, np.nanmax(np.abs(value), initial=0.0))
             np.testing.assert_allclose(got, value, rtol=0, atol=3e-5 * size)
-        memory = results[1]
+        exact.memory = results[1]
+
+
+# ---- loops, and what cannot be exported ----------------------------------------------------------
+
+
+def newton(x):
+    """The root of x[0], and in how many steps; the inner loop only spends rounds."""
+
+    def better(now):
+        count, y, _ = now
+        spent = jax.lax.while_loop(lambda k: k < x[1], lambda k: k + 1.0, 0.0 * y)
+        return count + 1, 0.5 * (y + x[0] / y), spent
+
+    def off(now):
+        return (jnp.abs(now[1] * now[1] - x[0]) > 1e-9) & (now[0] < 50)
+
+    count, y, spent = jax.lax.while_loop(off, better, (jnp.zeros((), jnp.int32), x[0], x[0]))
+    return jnp.stack([y, count.astype(x.dtype), spent])
+
+
+@each_way
+def test_a_loop_ends_where_its_numbers_say(way, tmp_path):
+    graph = ScalarGraph(loops=True)
+    x = np.array([graph.leaf("x", 0), graph.leaf("x", 1)])
+    [y] = lower(newton, graph, [x])
+    function = LawFunction("root", "a root", {"x": 2}, {"y": nodes(graph, y)})
+    root = way([function], tmp_path)["root"]
+    for square in (1.0, 2.0, 10.0, 1e6):
+        y, count, spent = root([square, 3.0])
+        assert y == pytest.approx(math.sqrt(square), abs=1e-9)
+        assert spent == (3.0 if count else square)
+        expected, steps = square, 0
+        while abs(expected * expected - square) > 1e-9 and steps < 50:
+            expected, steps = 0.5 * (expected + square / expected), steps + 1
+        assert (y, count) == (expected, steps)
+    # A graph of many agents, who would leave at different times, has no such loop.
+    with pytest.raises(Unsupported, match="a `while` loop whose end depends on the agent"):
+        lower(newton, ScalarGraph(), [np.array([ScalarGraph().leaf("x", k) for k in (0, 1)])])
+
+
+class MeanSensor(SensorStage):
+    """The mean of two measurements, computed on board or by the sensor itself."""
+
+    on_board: bool = eqx.field(default=True, static=True)
+
+    def begin(self, model, x):
+        return x
+
+    def read(self, model, memory, x, clock, number):
+        return 0.5 * (memory + x), x
+
+
+class DeafNetwork(IdealNetwork):
+    """Nobody hears anybody."""
+
+    def receive(self, loop, memory, known):
+        return super().receive(loop, memory, known._replace(said=0.0 * known.said))
+
+
+def test_a_sensor_of_your_own_that_is_on_board_is_in_the_law():
+    world = ech.World(members=lambda loop: loop.replace(sensing=Sensors((MeanSensor(),))))
+    agents = [ech.Agent(carts("consensus").replace(world=w), 1, 0.01) for w in (world, ech.World())]
+    sensed, exact = (
+        PlainAgent(one.own_law, as_python(agent_functions(one.own_law).values())) for one in agents
+    )
+    before, now = [0.1, 0.2, 0.0, 0.0], [0.3, -0.2, 0.4, 0.0]
+    sensed.step(0.0, before)
+    mean = [0.5 * (a + b) for a, b in zip(before, now, strict=True)]
+    said = sensed.step(0.01, now)[1]
+    assert said == exact.step(0.01, mean)[1] != exact.step(0.01, now)[1]
+    compare(agents[0], [sensed.law], 20, 0.01)
+
+
+def test_a_member_of_your_own_that_an_agent_alone_does_not_have_is_refused():
+    network = lambda loop: loop.replace(network=DeafNetwork(loop.network.leadership))  # noqa: E731
+    parts = carts("consensus").replace(world=ech.World(members=network))
+    own = ech.Agent(parts, 1, 0.01).own_law
+    with pytest.raises(
+        Unsupported, match=r"the member `DeafNetwork` of your own .*test_onboard.py"
+    ):
+        agent_functions(own)
+
+
+# ---- a flight ------------------------------------------------------------------------------------
 
 
 def fly(agents, bits, moves, starts, steps, folder):
     """Places (T, N, 3) of vehicles in double precision under laws in a precision."""
-    laws = []
+    plain, x = [], [list(map(float, start)) for start in starts]
     for agent in agents:
         own = folder / f"{bits}-{agent.number}"
         own.mkdir()
-        laws.append(as_compiled_c(law_functions(agent.own_law, bits).values(), own, bits))
-    owns, x = [agent.own_law for agent in agents], [list(map(float, start)) for start in starts]
-    memories = [law["begin"](state) for law, state in zip(laws, x, strict=True)]
+        law = as_compiled_c(agent_functions(agent.own_law, bits).values(), own, bits)
+        plain.append(PlainAgent(agent.own_law, law))
     places = []
+
+    def tell(sender, row):
+        for one in plain:
+            if sender in one.rows:
+                one.rows[sender] = row
+
     for k in range(steps):
-        t, forward = k * owns[0].loop.motion.dt, [math.nan] * len(owns[0].forward_names)
-        rows = [*zip(laws, x, memories, strict=True)]
-        signals = [law["signal"](t, state, memory) for law, state, memory in rows]
-        for i, (law, state, memory) in enumerate(rows):
-            gaps = [law["difference"](t, state, memory, signals[j]) for j in owns[i].neighbours]
-            z = [0.0] * len(signals[i])
-            for weight, gap in zip(owns[i].weights[0], gaps, strict=True):
-                z = [a + weight * b for a, b in zip(z, gap, strict=True)]
-            u, memories[i], _, message, valid = law["tick"](t, state, z, forward, memory)
+        t = k * agents[0].own_law.loop.motion.dt
+        rows = [one.speak(t, state) for one, state in zip(plain, x, strict=True)]
+        for sender, row in enumerate(rows):
+            tell(sender, row)
+        # The leader is the first one, and acts before the others.
+        for i, one in enumerate(plain):
+            u, row, valid = one.step(t, x[i])
             assert valid
-            # Of the leader, which is the first one, and acts before the others.
-            forward = message if i == 0 else forward
-            x[i], _ = moves(state, u, [], [0.0] * len(state))
+            tell(i, row)
+            x[i], _ = moves(x[i], u, [], [0.0] * len(x[i]))
         places.append([state[:3] for state in x])
     return np.array(places)
 

@@ -15,6 +15,8 @@ DT, SUBSTEPS, HORIZON = 0.02, 2, 8.0
 OFFSETS = [0.0, 0.0, 0.0], [0.0, 0.6, 0.0]
 STATES = {"x": "m", "y": "m", "z": "m", "vx": "m/s", "vy": "m/s", "vz": "m/s"}
 INPUTS = {"ax": "m/s^2", "ay": "m/s^2", "az": "m/s^2"}
+LETTER = {"time": 1, "hops": 1, "signal": 3, "leader": 1, "said": 1, "content": 3}
+"""The parts of a letter, and how many numbers each has."""
 
 LAW = '''"""The law of agent {agent}. Signals are stopping points: where it would come to rest."""
 
@@ -35,31 +37,25 @@ def begin(x):
     return []
 
 
-def signal(t, x, memory):
-    """The agent's stopping point, less its place in the formation."""
-    return [p + v / K - b for p, v, b in zip(x[:3], x[3:], OFFSET)]
+def step(t, x, received, memory):
+    """A step at t (s) with the last letter of the other agent, NaN for none.
 
-
-def difference(t, x, memory, place):
-    """How far the agent's signal is from another one."""
-    return [a - b for a, b in zip(signal(t, x, memory), place)]
-
-
-def expected(t, content, age):
-    """The leader's signal, its velocity, and whether they are valid, by what it said last."""
-    place, rate = plan(t)
-    return [a + b for a, b in zip(place, content)], rate, True
-
-
-def tick(t, x, z, forward, memory):
-    """A step with z, the weighted sum of differences from others, and the leader's velocity.
-
-    It returns the input, the memory, what the agent is and does, of the leader its deviation from
-    the plan, and whether all of it is valid.
+    It returns the input, the memory, its own letter, and whether all of it is valid. A letter has
+    time, hops to the leader, the sender's deviation from where it expects the leader, and what the
+    leader last said: its number, when, and its deviation from the plan.
     """
-    gap, rate = {gap}
+    place, rate = plan(t)
+    signal = [p + v / K - b for p, v, b in zip(x[:3], x[3:], OFFSET)]
+    off = [a - b for a, b in zip(signal, place)]
+    if {leads}:
+        gap, letter = off, [t, 0.0, 0.0, 0.0, 0.0, 0.0, t, *off]
+    else:
+        # Where the leader is expected; without a letter of it, where the plan has it.
+        heard = not math.isnan(received[0])
+        gap = [a - b for a, b in zip(off, received[7:] if heard else [0.0] * 3)]
+        letter = [t if heard else math.nan, 1.0, *gap, *received[5:]]
     u = [K * (r - GAIN * e - v) for r, e, v in zip(rate, gap, x[3:])]
-    return u, memory, signal(t, x, memory), rate, {content}all(map(math.isfinite, u))
+    return u, memory, letter, all(map(math.isfinite, u))
 '''
 
 VEHICLE = '''"""The motion of a simulated point in a part of a step."""
@@ -77,18 +73,12 @@ def move(x, u, memory, push):
 
 def law_files(agent: int) -> tuple[str, dict[str, Any]]:
     """Return law.py and the content of law.json."""
-    leads = agent == 0
-    gap = "difference(t, x, memory, plan(t)[0]), plan(t)[1]" if leads else "z, forward"
-    text = LAW.format(agent=agent, offset=OFFSETS[agent], gap=gap, content="gap, " if leads else "")
-    network = {
-        **{"period": 0.04, "uses": "all", "forget": 0.5, "forget_hops": 5.0, "moves": False},
-        **{"agents": 2, "leaders": [0], "content": 3},
-    }
+    text = LAW.format(agent=agent, offset=OFFSETS[agent], leads=agent == 0)
     return text, {
-        "agent": agent, "dt": DT, "leads": leads, "hears": [1 - agent], "weights": [1.0],
+        "agent": agent, "dt": DT, "leads": agent == 0, "hears": [1 - agent],
         "states": STATES, "inputs": INPUTS, "trim": dict.fromkeys(INPUTS, 0.0),
-        "signal": ["x", "y", "z"], "message": ["rate of x", "rate of y", "rate of z"],
-        "network": network, "sha256": {"law.py": hashlib.sha256(text.encode()).hexdigest()},
+        "message": LETTER, "network": {"period": 0.04, "leaders": [0]},
+        "sha256": {"law.py": hashlib.sha256(text.encode()).hexdigest()},
     }  # fmt: skip
 
 
@@ -105,7 +95,7 @@ def flight_facts() -> dict[str, Any]:
         "constant": zeros, "rms": zeros, "fade": 0.0, "noise": zeros,
     }  # fmt: skip
     return {
-        "agents": 2, "dt": DT, "horizon": HORIZON, "sizes": [3, 3], "leader": 0,
+        "agents": 2, "dt": DT, "horizon": HORIZON, "message": LETTER, "leader": 0,
         "leadership": None, "weather": {"delay": 0.0, "jitter": 0.0, "loss": 0.0},
         "position": [0, 1, 2], "velocity": [3, 4, 5], "tilt": [],
         "fence": {"low": [-2.0, -2.0, -0.1], "high": [2.0, 2.0, 2.0], "speed": 3.0},

@@ -7,7 +7,7 @@ from virtual_flight import Network, VirtualClock
 from echelon_flight import FlightError
 from echelon_flight.agent_process import AgentContext, AgentProcess, PlanClock
 from echelon_flight.links import Link, Reading
-from echelon_flight.wire import GROUND, Wire
+from echelon_flight.wire import GROUND, Message, Wire
 
 DT, KEY = 0.01, b"k" * 32
 FLIGHT = {
@@ -17,37 +17,36 @@ FLIGHT = {
     "tilt": [],
     "fence": {"low": [-5.0], "high": [5.0], "speed": 10.0},
 }
-NETWORK = {
-    "moves": False,
-    "period": 0.02,
-    "forget": 0.5,
-    "forget_hops": 5.0,
-    "agents": 2,
-    "leaders": [0],
-}
+PARTS = {"time": 1, "hops": 1, "signal": 1, "leader": 1, "said": 1, "content": 1, "term": 1}
 FACTS = {
-    **{"agent": 1, "dt": DT, "leads": False, "hears": [0], "weights": [1.0]},
-    **{"signal": ["x"], "message": ["v"], "network": {**NETWORK, "uses": "all"}},
+    **{"agent": 1, "dt": DT, "leads": False, "hears": [0]},
+    **{"message": PARTS, "network": {"period": 0.02, "leaders": [0]}},
 }
+
+
+def letter(sender, time, said=None, leader=0, hops=0.0, term=0.0):
+    """A letter whose packet is of the same time, unless one is given."""
+    said = time if said is None else said
+    return Message(sender, (time, float(hops), 0.0, float(leader), said, 0.0, float(term)))
 
 
 class Law:
-    """A law that returns its disagreement, or what a test wants."""
+    """A law that returns where the leader is expected, at t, less its place, or what a test wants.
+
+    It passes on the packet that it received.
+    """
 
     u, ticks = 0.0, 0
 
     def begin(self, x):
         return []
 
-    def difference(self, t, x, memory, place):
-        return [x[0] - place[0]]
-
-    def expected(self, t, content, age):
-        return [t], [1.0], True
-
-    def tick(self, t, x, z, forward, memory):
+    def step(self, t, x, received, memory):
         self.ticks += 1
-        return [self.u - z[0]], [], [x[0]], [0.0], math.isfinite(self.u)
+        heard = not math.isnan(received[0])
+        off = t - x[0] if heard else 0.0
+        row = [t if heard else math.nan, received[1] + 1.0, off, *received[3:]]
+        return [self.u + off], [], row, math.isfinite(self.u)
 
 
 class Fake(Link):
@@ -90,7 +89,7 @@ class Scene:
 
     def wire(self, number, key=KEY, formation="ab" * 32, **numbers):
         boot = self.clock.time_ns() // 1_000_000
-        return Wire(key, formation, number, 3, (1, 1), boot, **numbers)
+        return Wire(key, formation, number, 3, len(PARTS), boot, **numbers)
 
     def start(self):
         self.introduce()

@@ -3,11 +3,11 @@
 import math
 
 import pytest
-from agent_scene import DT, Scene
+from agent_scene import DT, Scene, letter
 
 from echelon_flight.links import Reading
 from echelon_flight.supervisor import Fault
-from echelon_flight.wire import GROUND, DatagramKind, Drop, LeaderPacket, Message, Report
+from echelon_flight.wire import GROUND, DatagramKind, Drop, Message, Report
 
 
 @pytest.fixture
@@ -25,8 +25,7 @@ def test_nothing_is_sent_before_the_start(scene):
 def test_letters_are_heard_and_answered(scene):
     scene.start()
     t = scene.context.clock.now
-    packet = LeaderPacket(0, t, (0.0,))
-    scene.air.send(scene.leader.letter(Message(0, t, 0, (0.0,), packet)))
+    scene.air.send(scene.leader.letter(letter(0, t)))
     scene.rounds(20)
     # The leader is expected at t, and the vehicle is at 0.
     assert scene.link.sent[-1][0] == pytest.approx(t, abs=1.0)
@@ -35,7 +34,8 @@ def test_letters_are_heard_and_answered(scene):
     now = scene.context.clock.now, scene.clock.time()
     letters = [wire.open(each, *now) for each in scene.air.receive()]
     bodies = [x.body for x in letters if not isinstance(x, Drop) and isinstance(x.body, Message)]
-    assert bodies and bodies[-1].packet == packet and bodies[-1].hops == 1
+    # The packet is the leader's, and passed on.
+    assert bodies and bodies[-1].row[1] == 1.0 and bodies[-1].row[3:] == letter(0, t).row[3:]
     # At the network's rate: every other state.
     assert len(bodies) <= 0.6 * len(scene.link.sent) + 2
 
@@ -154,12 +154,12 @@ def test_a_neighbour_whose_clock_is_ahead_is_told(scene, capsys):
     scene.start()
     for off, why in ((1.5, "that differs from this clock by"), (0.2, "ahead of this clock")):
         t = scene.context.clock.now + off
-        scene.air.send(scene.leader.letter(Message(0, t, 0, (0.0,), LeaderPacket(0, t, (0.0,)))))
+        scene.air.send(scene.leader.letter(letter(0, t)))
         scene.rounds(2)
         assert f"a datagram of agent 0 has a time stamp {why}" in capsys.readouterr().err
     # One that is late is none of them, and nobody is told.
     t = scene.context.clock.now - 0.5
-    scene.air.send(scene.leader.letter(Message(0, t, 0, (0.0,), LeaderPacket(0, t, (0.0,)))))
+    scene.air.send(scene.leader.letter(letter(0, t)))
     scene.rounds(2)
     assert not capsys.readouterr().err
 

@@ -18,7 +18,7 @@ REPORT = Report(1, 0, 0, 0.0, math.nan, 0.0, 0.0, 1.0, 0.0, 2e-4, 0.01, math.nan
 
 
 def wire(number, key=KEY, boot=BOOT, **options):
-    return Wire(key, "ab" * 32, number, 2, (1, 1), boot, **options)
+    return Wire(key, "ab" * 32, number, 2, 2, boot, **options)
 
 
 class Station:
@@ -127,6 +127,6 @@ MISTAKES = {
 
 @pytest.mark.parametrize("sentence", MISTAKES)
 def test_whose_datagrams_are_dropped_is_shown(sentence, station):
-    station.say(lambda now: wire(0).letter(Message(0, 99.0, 0, (0.0,), None)))
+    station.say(lambda now: wire(0).letter(Message(0, (99.0, 0.0))))
     station.say(MISTAKES[sentence])
     assert station.ground.state()["dropped"] == [sentence]

@@ -22,7 +22,7 @@ def browser():
 
 
 def wire(number, key=b"k" * 32):
-    return Wire(key, "ab" * 32, number, 3, (1, 1), time.time_ns() // 1_000_000)
+    return Wire(key, "ab" * 32, number, 3, 2, time.time_ns() // 1_000_000)
 
 
 def report(leader, fault=Fault.NONE, amount=0.0):

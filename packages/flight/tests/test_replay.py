@@ -7,12 +7,12 @@ import math
 from pathlib import Path
 
 import pytest
-from agent_scene import KEY, Scene
+from agent_scene import KEY, PARTS, Scene, letter
 
 from echelon_flight import FlightError
 from echelon_flight.mission import NumberFile
 from echelon_flight.supervisor import Fault
-from echelon_flight.wire import GROUND, DatagramKind, Drop, LeaderPacket, Message, Report, Wire
+from echelon_flight.wire import GROUND, DatagramKind, Drop, Report, Wire
 
 WALL, BOOT, MARK = 1.8e9, 1_800_000_000_000, "ab" * 32
 TIMES = [0.02 * k for k in range(1, 200)]
@@ -20,11 +20,7 @@ STATE = Report(0, 0, 0, 0.0, math.nan, *[0.0] * 7, (0,) * len(Drop))
 
 
 def wire(number, highest=0, boot=BOOT):
-    return Wire(KEY, MARK, number, 3, (1, 1), boot, highest)
-
-
-def letter(sender, t, term=0):
-    return Message(sender, t, 0, (0.0,), LeaderPacket(sender, t, (0.0,), term))
+    return Wire(KEY, MARK, number, 3, len(PARTS), boot, highest)
 
 
 def join(ground, agent):
@@ -45,7 +41,7 @@ class Recorded:
         self.ground.begin(self.ground.next_flight(WALL))
         assert all(join(self.ground, each) for each in (self.leader, self.backup, self.agent))
         self.letters = [(t, self.leader.letter(letter(0, t))) for t in TIMES]
-        self.letters += [(t, self.backup.letter(letter(2, t, term=1))) for t in TIMES]
+        self.letters += [(t, self.backup.letter(letter(2, t, leader=2, term=1))) for t in TIMES]
         self.ground.challenges[1] = self.agent.challenge
         self.commands = [self.ground.start(WALL, WALL + 1.0, to) for to in (0, 1, 2, 0xFFFE)]
         self.ground.highest = self.ground.next_flight(WALL + 60.0)
@@ -154,7 +150,7 @@ def test_a_stop_ends_one_flight_and_not_the_next(tmp_path):
     stop = None
     for begins in (WALL + 60.0, WALL):
         file, agent = NumberFile(key, "ground"), wire(1)
-        ground = Wire(KEY, MARK, GROUND, 3, (1, 1), BOOT, file.read(), file.write)
+        ground = Wire(KEY, MARK, GROUND, 3, len(PARTS), BOOT, file.read(), file.write)
         ground.begin(ground.next_flight(begins))
         assert join(ground, agent)
         if stop is not None:
@@ -170,8 +166,7 @@ def replay(scene, other, term, count=40):
         t = scene.context.clock.now
         if k % 4 == 0:
             scene.air.send(scene.leader.letter(letter(0, t)))
-        packet = LeaderPacket(2, t - 0.9, (0.0,), term)
-        scene.air.send(other.letter(Message(0, t, 0, (0.0,), packet)))
+        scene.air.send(other.letter(letter(0, t, said=t - 0.9, leader=2, term=term)))
         scene.rounds(1)
 
 
@@ -186,7 +181,8 @@ def test_replayed_letters_let_nobody_take_the_lead(backups, monkeypatch):
     scene.rounds(2)
     for term in (0, 1, 7):
         replay(scene, earlier, term)
-        assert scene.process.pilot.leader == 0 and not scene.process.pilot.box.packet.term
+        assert scene.process.pilot.leader == 0
+        assert scene.process.pilot.box.letters[0].row[-1] == 0.0
     assert scene.context.wire.dropped == {Drop.FLIGHT: 120} and scene.fault is Fault.NONE
 
 

@@ -122,8 +122,8 @@ class AgentProcess:
         flight = context.flight
         self.context, self._seconds, self._dt = context, seconds, flight["dt"]
         self.supervisor = Supervisor(flight, Fence(**flight["fence"]))
-        hold = 2.0 * context.facts["network"]["forget"]
-        self.pilot = Pilot(context.law, context.facts, flight["leadership"], hold)
+        leadership = flight["leadership"] or {"backups": ()}
+        self.pilot = Pilot(context.law, context.facts, leadership["backups"])
         self._reading: Reading | None = None
         self._began, self._ticked, self._fell = time.monotonic(), -math.inf, math.inf
         self._due = 0.0

@@ -49,12 +49,17 @@ class Mission:
         facts: the content of flight.json.
 
     Raises:
-        FlightError: it is no such folder.
+        FlightError: it is no such folder, or of an earlier version.
     """
 
     def __init__(self, folder: Path) -> None:
         """Read flight.json."""
         self.folder, self.facts = folder, _read(folder / "flight.json")
+        if "message" not in self.facts:
+            raise FlightError(
+                f"`{folder}` was prepared by an earlier version; prepare it again with "
+                "`echelon fly`."
+            )
 
     @property
     def agents(self) -> int:
@@ -82,11 +87,6 @@ class Mission:
                 f"the law in `{file.parent}` is of another formation than `{self.folder}`; write "
                 "both again from one scenario."
             )
-        if "backups" not in (self.facts["leadership"] or {"backups": ()}):
-            raise FlightError(
-                f"`{self.folder}` was prepared by an earlier version; prepare it again with "
-                "`echelon fly`."
-            )
         return load_module(file), facts
 
     def wire(self, number: int, key: Path | None) -> Wire:
@@ -95,10 +95,10 @@ class Mission:
         Raises:
             FlightError: the key cannot be used, or the flight number beside it.
         """
-        secret, (first, second) = read_key(key), self.facts["sizes"]
+        secret, size = read_key(key), sum(self.facts["message"].values())
         assert key is not None
         file = NumberFile(key, "ground" if number == GROUND else f"agent-{number}")
-        common = secret, self.facts["formation"], number, self.agents, (first, second)
+        common = secret, self.facts["formation"], number, self.agents, size
         return Wire(*common, time.time_ns() // 1_000_000, file.read(), file.write)
 
 

@@ -18,15 +18,15 @@ from typing import Final, NamedTuple, final
 
 from echelon_flight import FlightError
 
-VERSION: Final = 2
+VERSION: Final = 3
 GROUND: Final = 0xFFFF
 """The number of the ground station as a sender."""
 ALL: Final = 0xFFFE
 """Whom a command is for that answers no challenge."""
 LONGEST: Final = 480
 """Bytes, which no network splits; 200 suffice for four outputs."""
-LARGEST: Final = 1e6
-"""Of a deviation."""
+LARGEST: Final = 1e7
+"""Of a number of a letter."""
 APART: Final = 1.0
 """s; clocks that differ by more are wrong."""
 
@@ -52,7 +52,7 @@ class Drop(enum.Enum):
     FORMATION = "is of another formation"
     SIGNATURE = "is signed with another key"
     NOT_FINITE = "has a number that is not finite"
-    TOO_LARGE = "has a deviation larger than 1e6"
+    TOO_LARGE = "has a number larger than 1e7"
     CLOCK = "has a time stamp that differs from this clock by more than 1 s"
     OLD = "is not newer than the last one from its sender"
     SENDER = "is from a sender that this process does not listen to"
@@ -64,43 +64,21 @@ class Drop(enum.Enum):
     CHALLENGE = "answers an earlier process of this agent"
 
 
-class LeaderPacket(NamedTuple):
-    """What a leader last said of itself, passed on unchanged.
-
-    Attributes:
-        leader: its number.
-        time: of the plan, when it said so, s.
-        content: its deviation from its plan, or what else the prediction needs (p,).
-        term: how often backup leaders took the lead over.
-    """
-
-    leader: int
-    time: float
-    content: tuple[float, ...]
-    term: int = 0
-
-    @property
-    def rank(self) -> tuple[int, int, float]:
-        """By which the greater of two packets is used: later term, lower leader, newer."""
-        return self.term, -self.leader, self.time
-
-
 class Message(NamedTuple):
     """What an agent sends to those that hear it.
 
     Attributes:
         sender: its number.
-        time: of the plan, s.
-        hops: to a leader.
-        value: (s,) its deviation from where it expects the leader, or its signal.
-        packet: the newest of a leader; None before it has one.
+        row: its numbers, as its law returns them; the first one is the time of the plan, s.
     """
 
     sender: int
-    time: float
-    hops: int
-    value: tuple[float, ...]
-    packet: LeaderPacket | None
+    row: tuple[float, ...]
+
+    @property
+    def time(self) -> float:
+        """When it was sent, a time of the plan, s."""
+        return self.row[0]
 
 
 class Report(NamedTuple):
@@ -167,7 +145,7 @@ class Wire:
         formation: its mark, in hexadecimal digits.
         number: of the agent, or `GROUND`.
         agents: how many there are.
-        sizes: of a letter's value and of a packet's content.
+        size: how many numbers a letter has, its time included.
         boot: when the process began, ms since 1970, so that its numbers are no replay of the last
             process's.
         highest: flight number that a process of this number has used.
@@ -188,7 +166,7 @@ class Wire:
         formation: str,
         number: int,
         agents: int,
-        sizes: tuple[int, int],
+        size: int,
         boot: int,
         highest: int = 0,
         store: Callable[[int], object] = lambda number: None,
@@ -196,8 +174,7 @@ class Wire:
         """Begin to count."""
         self._key, self._formation = key, bytes.fromhex(formation)[:8]
         self.number, self.boot, self._agents, self._count = number, boot, agents, 0
-        self._letter = struct.Struct(f"<HHB{sizes[0]}dHd{sizes[1]}d")
-        self._sizes, self._store = sizes, store
+        self._letter, self._store = struct.Struct(f"<{size - 1}d"), store
         self.flight, self.highest = 0, highest
         self.challenge, self.challenges = secrets.randbits(64), dict[int, int]()
         bodies = {
@@ -213,8 +190,8 @@ class Wire:
         self.dropped, self.suspects = Counter[Drop](), dict[Drop, int]()
         if max(self._lengths.values()) > LONGEST:
             raise FlightError(
-                f"a letter has {max(self._lengths.values())} bytes, with {sizes[0]} numbers of a "
-                f"deviation and {sizes[1]} of a leader, and may have {LONGEST}."
+                f"a letter of {size} numbers has {max(self._lengths.values())} bytes, and may have "
+                f"{LONGEST}."
             )
 
     def begin(self, flight: int) -> None:
@@ -243,12 +220,7 @@ class Wire:
 
     def letter(self, letter: Message) -> bytes:
         """Return the datagram of a letter."""
-        packet = letter.packet or LeaderPacket(0, 0.0, (0.0,) * self._sizes[1])
-        head = packet.term, letter.hops, letter.packet is not None
-        rest = packet.leader, packet.time, *packet.content
-        return self._sign(
-            DatagramKind.LETTER, letter.time, self._letter.pack(*head, *letter.value, *rest)
-        )
+        return self._sign(DatagramKind.LETTER, letter.time, self._letter.pack(*letter.row[1:]))
 
     def start(self, wall: float, at: float, to: int = ALL) -> bytes:
         """Return the command that the plan starts at a time, both in s since 1970, to an agent."""
@@ -397,15 +369,12 @@ class Wire:
         return None if own else Drop.EARLY
 
     def _read_letter(self, sender: int, stamp: float, text: bytes) -> Message | Drop:
-        term, hops, has, *numbers = self._letter.unpack(text)
-        split = self._sizes[0]
-        value, (leader, said, *content) = numbers[:split], numbers[split:]
+        numbers = self._letter.unpack(text)
         if not all(map(math.isfinite, numbers)):
             return Drop.NOT_FINITE
-        if max(map(abs, (*value, *content)), default=0.0) > LARGEST:
+        if max(map(abs, numbers), default=0.0) > LARGEST:
             return Drop.TOO_LARGE
-        packet = LeaderPacket(leader, said, tuple(content), term) if has else None
-        return Message(sender, stamp, hops, tuple(value), packet)
+        return Message(sender, (stamp, *numbers))
 
 
 def sender_of(datagram: bytes) -> int | None:

@@ -10,7 +10,6 @@ from jaxtyping import Float
 from echelon.agents.network.channel import NEVER
 from echelon.core.types import Array
 from echelon.core.words import Word
-from echelon_flight.wire import LeaderPacket
 
 LARGEST = 1e12
 """Of a value, in its own unit: a product of some of them is still finite."""
@@ -33,6 +32,22 @@ class NamedValues(NamedTuple):
 
     names: tuple[str, ...]
     values: Array
+
+
+class LeaderPacket(NamedTuple):
+    """What a leader last said of itself, passed on unchanged.
+
+    Attributes:
+        leader: its number.
+        time: when it said so, s.
+        content: its deviation from its plan, or what else the prediction needs (p,).
+        term: how often backup leaders took the lead over.
+    """
+
+    leader: int
+    time: float
+    content: tuple[float, ...]
+    term: int = 0
 
 
 class Message(NamedTuple):
@@ -237,7 +252,7 @@ class Surroundings:
         return True
 
 
-_FAR = 2**30
+_FAR = 2**23
 """Hops of a sender that no leader reaches."""
 _AHEAD = 0.05
 """s; by so much clocks may differ."""

@@ -11,7 +11,7 @@ from echelon.core.types import Array
 
 Stretch: TypeAlias = tuple[float, Iterable[Sequence[float]]]
 """Start (s) and edges of a stretch of time."""
-_ROUNDED = 1e-9
+ROUNDED = 1e-9
 """Share of a step by which rounding may put a switch before the step that it belongs to."""
 _MOST_PERIODS = 20
 """After so many periods at most, their rounding to steps is to repeat."""
@@ -46,7 +46,7 @@ class Schedule(NamedTuple):
     def rows(self, times: Array | float) -> Array:
         """Return which rows hold at times (T,) (s)."""
         # Rounded before the modulus: a time just below the period belongs to the first row.
-        times = np.asarray(times, float) + _ROUNDED
+        times = np.asarray(times, float) + ROUNDED
         times = times if self.period is None else times % self.period
         return np.searchsorted(self.starts, times, side="right") - 1
 
@@ -55,7 +55,7 @@ class Schedule(NamedTuple):
         rounds = 1 if self.period is None else int(np.floor(horizon / self.period)) + 1
         begins = (first + np.arange(rounds)) * (self.period or 0.0)
         times = (begins[:, None] + self.starts).reshape(-1)
-        steps = np.ceil(times / dt - _ROUNDED).astype(np.int64)
+        steps = np.ceil(times / dt - ROUNDED).astype(np.int64)
         rows = np.tile(np.arange(len(self.starts)), rounds)
         # Of two switches at one step the later one counts.
         last = np.append(np.diff(steps) > 0, True)
@@ -72,7 +72,7 @@ class Schedule(NamedTuple):
             counts = self.period / dt * np.arange(1, _MOST_PERIODS + 1)
             # Of periods of more steps than numbers have nothing is known.
             counts = counts[counts < 2.0**53]
-            whole = np.flatnonzero(np.abs(counts - np.round(counts)) <= _ROUNDED + 4e-16 * counts)
+            whole = np.flatnonzero(np.abs(counts - np.round(counts)) <= ROUNDED + 4e-16 * counts)
             if not len(whole):
                 return None
             periods = int(whole[0]) + 1

@@ -22,25 +22,27 @@ from echelon.core.trace import shared_traces
 from echelon.core.types import Array, JsonObject
 from echelon.core.words import MessageContent, Verdict
 from echelon.guarantees.promises.promise import guarantee_data
-from echelon.laws.law import Speaks, Travels
+from echelon.laws.law import Travels
 from echelon.output.archive.folder import write_errors
 from echelon.simulation.engine.agent import Agent, OwnLaw
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.onboard.law_functions import (
-    LawFunction,
-    law_functions,
-    message_meaning,
-    message_words,
+from echelon.simulation.onboard.agent_functions import (
+    agent_functions,
+    message_sizes,
     motions_of,
     move_function,
+    senders_of,
+)
+from echelon.simulation.onboard.message_words import (
+    message_meaning,
+    message_words,
     normalized_equation,
 )
-from echelon.simulation.onboard.source_code import c_text, header_text, python_text
+from echelon.simulation.onboard.source_code import LawFunction, c_text, header_text, python_text
 from echelon.simulation.scalars import Unsupported
-from echelon.simulation.step.networks import HOP_LIFE, LateNetwork
-from echelon.simulation.step.places import MovingPlaces
+from echelon.simulation.step.networks import LateNetwork
 from echelon.simulation.step.settings import Settings
 
 _EXCLUDES = (
@@ -66,7 +68,7 @@ def law_files(parts: Parts, settings: Settings, agent: int, formation: str) -> d
         EchelonError: there is no such agent, or the parts do not fit each other.
     """
     own, double = _traced(parts, settings, agent)
-    single, functions = law_functions(own, 32), double.values()
+    single, functions = agent_functions(own, 32), double.values()
     about, constants = _head(settings, agent, formation)
     files = {
         "law.py": python_text(functions, about, constants),
@@ -90,7 +92,7 @@ def python_law(
 def _traced(parts: Parts, settings: Settings, agent: int) -> tuple[OwnLaw, dict[str, LawFunction]]:
     own = Agent(parts, agent, settings.dt, settings.limits).own_law
     try:
-        return own, law_functions(own)
+        return own, agent_functions(own)
     except Unsupported as error:
         raise OutputError(
             f"the law of agent {agent} cannot be exported: there is no code for {error}."
@@ -116,7 +118,7 @@ def _facts(
         "formation": constants["FORMATION"],
         **_description(own, functions),
         "dt": dt,
-        "network": network_facts(own, dt, functions),
+        "network": _network_facts(own, dt),
         "guarantee": {key: stated[key] for key in _STATED} | _failed(stated),
         "excluded": [*_EXCLUDES, _LATE if isinstance(own.loop.network, LateNetwork) else _CURRENT],
         "echelon": __version__,
@@ -140,51 +142,32 @@ def _sizes(functions: Mapping[str, LawFunction]) -> dict[str, int]:
 
 
 def _description(own: OwnLaw, functions: Mapping[str, LawFunction]) -> JsonObject:
-    model, schedule, switching = own.loop.model, own.schedule, None
-    if schedule is not None:
-        starts, weights = schedule.starts.tolist(), own.weights.tolist()
-        switching = {"starts": starts, "weights": weights, "period": schedule.period}
+    model = own.loop.model
     return {
         "leads": own.leads,
-        "hears": list(own.neighbours),
-        "weights": own.weights[0].tolist(),
-        "switching": switching,
+        "hears": senders_of(own),
+        "message": message_sizes(own),
+        "signal": list(own.signal_names),
+        "feed_forward": message_words(own),
         "feed_forward_from": own.source,
+        "feed_forward_meaning": message_meaning(own),
         "states": dict(zip(model.state_names, model.state_units, strict=True)),
         "inputs": dict(zip(model.input_names, model.input_units, strict=True)),
         "trim": dict(zip(model.input_names, model.trim[1], strict=True)),
         "scale": np.asarray(model.input_scale, float).tolist(),
         "normalized": normalized_equation(model),
-        "signal": list(own.signal_names),
-        "message": message_words(own),
-        "message_meaning": message_meaning(own),
         "memory": len(functions["begin"].outputs["memory"]),
         "operations": {name: f.operations for name, f in functions.items()},
     }
 
 
-def network_facts(
-    own: OwnLaw, dt: float, functions: Mapping[str, LawFunction]
-) -> JsonObject | None:
-    """Return what an agent needs for messages that are late; None in the ideal network."""
-    loop, network = own.loop, own.loop.network
+def _network_facts(own: OwnLaw, dt: float) -> JsonObject | None:
+    """Return what an agent needs to send messages that are late; None in the ideal network."""
+    network = own.loop.network
     if not isinstance(network, LateNetwork):
         return None
-    channel = network.medium
-    expected, forget = functions.get("expected"), float(channel.forget) * dt
-    size = len(own.forward_names) if expected is None else expected.inputs["content"]
-    return {
-        "period": int(channel.every) * dt,
-        "messages": str(channel.messages),
-        "prediction": str(channel.prediction),
-        "uses": str(channel.hears),
-        "forget": forget,
-        "forget_hops": HOP_LIFE * forget,
-        "agents": len(loop.laws.order),
-        "leaders": loop.laws.leaders.tolist(),
-        "content": size,
-        "moves": isinstance(loop.places, MovingPlaces) and Speaks.may(own.law, "goal_offset"),
-    }
+    period, messages = int(network.medium.every) * dt, str(network.medium.messages)
+    return {"period": period, "messages": messages, "leaders": own.loop.laws.leaders.tolist()}
 
 
 def save_law(files: Mapping[str, str], folder: Path) -> None:
@@ -221,7 +204,7 @@ def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, 
     agents, rule = parts.graph.agents, parts.leadership
     files, stated = dict[str, str](), guarantee_data(parts, settings)
     for k in range(agents):
-        law = python_law(parts.replace(leadership=None), settings, k, formation, stated)
+        law = python_law(parts, settings, k, formation, stated)
         files |= {f"law-{k}/{name}": text for name, text in law.items()}
     facts = json.loads(files["law-0/law.json"])
     vehicles = _vehicles(parts, settings)
@@ -230,7 +213,7 @@ def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, 
         "agents": agents,
         "dt": settings.dt,
         "horizon": settings.horizon,
-        "sizes": [len(facts["signal"]), facts["network"]["content"]],
+        "message": facts["message"],
         "leader": min(parts.graph.leaders),
         "leadership": rule and {"backups": list(rule.backups), "timeout": rule.timeout},
         "weather": {"delay": network.delay, "jitter": network.jitter, "loss": network.loss},

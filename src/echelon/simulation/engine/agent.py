@@ -31,25 +31,18 @@ from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.step.alone import (
     Arrived,
-    ReceivingIdeally,
-    ReceivingLate,
+    OwnMemory,
     after_mail,
     alone,
+    begin_alone,
+    step_alone,
 )
 from echelon.simulation.step.assembly import assemble
 from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.networks import LateNetwork, MessageRules
 from echelon.simulation.step.places import MovingPlaces
-from echelon.simulation.step.records import (
-    Control,
-    LawMemories,
-    LeaderPackets,
-    LoopState,
-    Messages,
-    Seconds,
-)
-from echelon.simulation.step.run_laws import feedforward_of, has_angles
-from echelon.simulation.step.sequence import begin, control, hear
+from echelon.simulation.step.records import Control, LeaderPackets, Messages
+from echelon.simulation.step.run_laws import feedforward_of
 from echelon.simulation.step.settings import Settings
 from echelon.simulation.step.turns import by_depth
 
@@ -62,7 +55,6 @@ class OwnLaw(NamedTuple):
         leads: whether it is a leader.
         number: of the agent.
         neighbours: the numbers of those that it hears.
-        weights: of their signals (rows, K); a graph that switches has several rows.
         signal_names, forward_names: of what it sends.
         source: whose feed-forward it uses; None for nobody's.
         schedule: when which row of weights holds, of a graph that switches.
@@ -72,7 +64,6 @@ class OwnLaw(NamedTuple):
     leads: bool
     number: int
     neighbours: tuple[int, ...]
-    weights: Array
     signal_names: tuple[str, ...]
     forward_names: tuple[str, ...]
     source: int | None
@@ -83,29 +74,17 @@ class OwnLaw(NamedTuple):
         """The leaders' law or the others'."""
         return self.loop.laws.leader if self.leads else self.loop.laws.follower
 
-    def weights_at(self, t: float) -> Array:
-        """Return the weights (K,) of the neighbours' signals at a time (s)."""
-        return self.weights[self.schedule.row(t) if self.schedule else 0]
-
 
 @cached_jit
-def act_alone(loop: Loop, now: LoopState, clock: Seconds) -> tuple[Control, jax.Array]:
-    """Return what an agent does, and whether all of that and its state is finite."""
-    acted = control(loop, now, clock)
-    return acted, is_finite((now.states, acted))
+def act_alone(
+    loop: Loop, own: OwnMemory, t: jax.Array, x: State
+) -> tuple[Control, OwnMemory, jax.Array]:
+    """Return what an agent does, its memory, and whether all of that and its state is finite."""
+    acted, after = step_alone(loop, own, t, x)
+    return acted, after, is_finite((x, acted))
 
 
-@cached_jit
-def beside_others(loop: Loop, now: LoopState, clock: Seconds) -> tuple[LawMemories, jax.Array]:
-    """Return the memory of an agent that begins late, and whether it has heard of others.
-
-    An angle is a number that grows with every turn, and who begins late knows none of them: it
-    takes them from another's signal.
-    """
-    known, _, network = hear(loop, now, clock)
-    assert isinstance(loop.network, ReceivingIdeally | ReceivingLate), "it is alone"
-    other, there = loop.network.another(network, known.heard)
-    return loop.laws.beside(now.memory.laws, there[None], other), there
+_begin = cached_jit(begin_alone)
 
 
 def is_finite(tree: PyTree) -> jax.Array:
@@ -179,10 +158,8 @@ class Agent:
             if isinstance(loop.network, LateNetwork)
             else Mail(own, Inbox(own.neighbours, own.source, own.signal_names, own.forward_names))
         )
-        self._loop = alone(loop, self.number, self._mail.arrived)
-        self._now: LoopState | None = None
-        # When it first acted (s), and whether it has yet to learn how often others turned.
-        self._begun, self._asks = math.inf, False
+        self._loop = alone(loop, self.number, self._mail.arrived, own.schedule)
+        self._memory: OwnMemory | None = None
         self._time, self.blind = -math.inf, 0
         self._last: tuple[Array, Message | None] = np.array(loop.model.trim[1], float), None
 
@@ -204,7 +181,7 @@ class Agent:
         """
         if t is None and isinstance(self._loop.places, MovingPlaces):
             raise SimulationError("the formation changes with time; call `hello(x, t)`.")
-        acted, finite = self._act(float(t or 0.0), x)[1:3]
+        acted, _, finite = self._act(float(t or 0.0), x)
         return self._mail.hello(acted) if finite else self._last[1]
 
     def step(self, t: float, x: ArrayLike) -> tuple[Array, Message | None]:
@@ -226,31 +203,22 @@ class Agent:
                 f"last step was at {self._time:g} s."
             )
         self._time = self._mail.inbox.clock = float(t)
-        now, acted, finite, asks = self._act(self._time, x)
+        acted, after, finite = self._act(self._time, x)
         if finite:
-            self._now, self._asks = now._replace(memory=acted.memory), asks
-            self._begun = min(self._begun, self._time)
+            self._memory = after
             self.leads = self.leads or self._mail.leads(acted)
             self._last = np.asarray(acted.inputs)[0], self._mail.written(acted)
         else:
             self.blind += 1
         return self._last
 
-    def _act(self, t: float, x: ArrayLike) -> tuple[LoopState, Control, bool, bool]:
-        """Return the moment, what the agent does, whether it is finite, and whether it asks."""
-        state = self._state(x)[None]
+    def _act(self, t: float, x: ArrayLike) -> tuple[Control, OwnMemory, bool]:
+        """Return what the agent does, its memory after it, and whether all of it is finite."""
+        state, loop = self._state(x), after_mail(self._loop, self._mail.arrived)
         with precision("float64"):
-            states = jnp.asarray(state)
-            loop = after_mail(self._loop, self._mail.arrived, self.own_law.weights_at(t))
-            asks, first = self._asks, self._now is None
-            now = (self._now or begin(loop, states))._replace(states=states)
-            begun = jnp.asarray(min(self._begun, t))
-            clock = Seconds(jnp.asarray(t), loop.motion.dt, begun, jnp.asarray(first))
-            if asks or first and t > 0.0 and has_angles(loop.laws.follower):
-                laws, heard = beside_others(loop, now, clock)
-                now, asks = now._replace(memory=now.memory._replace(laws=laws)), not heard
-            acted, finite = act_alone(loop, now, clock)
-        return now, acted, bool(finite), asks
+            memory = self._memory or _begin(loop, jnp.asarray(state))
+            acted, after, finite = act_alone(loop, memory, jnp.asarray(t), jnp.asarray(state))
+        return acted, after, bool(finite)
 
     def _state(self, x: ArrayLike) -> Array:
         state, n = np.asarray(x), len(self._loop.model.state_names)
@@ -271,7 +239,7 @@ class Mail:
     """
 
     def __init__(self, own: OwnLaw, inbox: Inbox) -> None:
-        self._own, self.inbox, names = own, inbox, _hull_names(own)
+        self._own, self.inbox, names = own, inbox, hull_names(own)
         # Of others than neighbours the place alone is used, where agents keep apart.
         others = [k for k in range(own.loop.agents) if k != own.number] if names else []
         self._others = Surroundings(others, names, inbox)
@@ -356,10 +324,9 @@ def _own_law(loop: Loop, parts: Parts, number: int) -> OwnLaw:
     exchange, leads = loop.graph.exchange, number in parts.graph.leaders
     edges = np.asarray(exchange.receivers) == number
     neighbours = tuple(np.asarray(exchange.senders)[edges].tolist())
-    weights = np.atleast_2d(np.asarray(exchange.weights))[:, edges]
     with precision("float64"):
         names = _names(loop, loop.laws.leader if leads else loop.laws.follower)
-    rows = neighbours, weights, *names, _source_in(loop, parts, number, leads)
+    rows = neighbours, *names, _source_in(loop, parts, number, leads)
     return OwnLaw(loop, leads, number, *rows, parts.graph.schedule)
 
 
@@ -374,7 +341,7 @@ def _source_in(loop: Loop, parts: Parts, number: int, leads: bool) -> int | None
     return parts.graph.nearest_leader()[number]
 
 
-def _hull_names(own: OwnLaw) -> tuple[str, ...]:
+def hull_names(own: OwnLaw) -> tuple[str, ...]:
     """Return the names of the numbers of an agent's hull; () where agents do not keep apart."""
     loop, model = own.loop, own.loop.model
     if not loop.surroundings.keeps_apart:

@@ -4,17 +4,49 @@ In C no memory is allocated, and of the library only `sqrt` is called. Python ha
 `math`.
 """
 
+import itertools
 import json
 import math
 from collections.abc import Callable, Collection, Mapping
 from string import Template
-from typing import NamedTuple
+from typing import NamedTuple, final
 
 import numpy as np
 
 from echelon.simulation.codegen.scheduling import depth_first, lateness
-from echelon.simulation.onboard.law_functions import LawFunction
-from echelon.simulation.scalars import Node, needed
+from echelon.simulation.scalars import Node, needed, within
+
+
+class LawFunction(NamedTuple):
+    """A function of numbers.
+
+    Attributes:
+        name: of the function.
+        about: what it does, a sentence.
+        inputs: name -> how many numbers it has; None for a number that is no array.
+        outputs: name -> its numbers.
+        valid: whether all that the outputs rest on is finite and accurate; None if not computed.
+    """
+
+    name: str
+    about: str
+    inputs: Mapping[str, int | None]
+    outputs: Mapping[str, list[Node]]
+    valid: Node | None = None
+
+    @property
+    def results(self) -> list[Node]:
+        """All outputs, and whether they are valid."""
+        valid = [] if self.valid is None else [self.valid]
+        return sum(self.outputs.values(), start=valid)
+
+    @property
+    def operations(self) -> int:
+        """How many operations there are; those of loops may be done several times, or never."""
+        return sum(node.op not in _NO_OPERATION for node in needed(self.results))
+
+
+_NO_OPERATION = ("constant", "leaf", "carried", "loop", "result")
 
 COMMON = {
     "add": "{0} + {1}",
@@ -51,6 +83,8 @@ class Syntax(NamedTuple):
         entry: an assignment, with the places of a `word`, and of the `name` and `place` of a number
             in an array.
         number, truth: an assignment, with the places of a name and an expression.
+        carried, again: that of a number that a loop carries, before the loop and in it.
+        loop: lines that begin a loop, that leave it unless a truth holds, and that end it.
         helpers: functions by name, each after those that it calls.
     """
 
@@ -60,6 +94,9 @@ class Syntax(NamedTuple):
     entry: str
     number: str
     truth: str
+    carried: str
+    again: str
+    loop: tuple[str, str, str]
     helpers: Mapping[str, str]
 
     def used_helpers(self, text: str) -> str:
@@ -71,29 +108,80 @@ class Syntax(NamedTuple):
         return used
 
 
-class Statements(NamedTuple):
-    """The assignments of a function, and the word for each node."""
+@final
+class Statements:
+    """The assignments that compute the results of a function.
 
-    lines: list[str]
-    words: Mapping[Node, str]
+    Attributes:
+        lines: of the text.
+        words: for each node.
+    """
 
+    def __init__(self, function: LawFunction, syntax: Syntax) -> None:
+        self.lines, self.words = list[str](), dict[Node, str]()
+        self._syntax, self._count = syntax, itertools.count()
+        # Each result is computed before the next is begun: a compiler needs less of the stack.
+        self._order = depth_first(function.results, lateness(needed(function.results)))
+        self._loops = {
+            node.value: within(node.value, node.args) for node in self._order if node.op == "loop"
+        }
+        self._write({*self._order}, frozenset(), "")
 
-def statements(function: LawFunction, syntax: Syntax) -> Statements:
-    """Return the assignments that compute the results of a function."""
-    lines, words = list[str](), dict[Node, str]()
-    # Each result is computed before the next is begun, so that a compiler needs less of the stack.
-    for node in depth_first(function.results, lateness(needed(function.results))):
+    def _write(self, nodes: Collection[Node], inside: frozenset[int], indent: str) -> None:
+        """Write what is computed in some loops, and in no other."""
+        for node in self._order:
+            loops = (loop for loop, changes in self._loops.items() if changes.get(node))
+            if node in nodes and node not in self.words and inside.issuperset(loops):
+                self._write_one(node, inside, indent)
+
+    def _write_one(self, node: Node, inside: frozenset[int], indent: str) -> None:
+        syntax, words = self._syntax, self.words
         if node.op == "constant":
             words[node] = syntax.literal(node.value)
         elif node.op == "leaf":
             name, *place = node.value
             words[node] = word = syntax.word.format("".join(map(str, node.value)))
-            lines += [syntax.entry.format(word=word, name=name, place=k) for k in place]
+            entries = (syntax.entry.format(word=word, name=name, place=k) for k in place)
+            self.lines += [indent + entry for entry in entries]
+        elif node.op == "loop":
+            words[node] = ""
+            self._write_loop(node, inside, indent)
+        elif node.op == "result":
+            words[node] = _carried_word(node.args[0].value, node.value)
         else:
-            words[node] = word = syntax.word.format(f"v{len(lines)}")
             expression = syntax.operations[node.op].format(*(words[a] for a in node.args))
-            lines.append((syntax.truth if node.truth else syntax.number).format(word, expression))
-    return Statements(lines, words)
+            words[node] = self._assign(indent, expression, node.truth)
+
+    def _assign(self, indent: str, expression: str, truth: bool = False) -> str:
+        word = self._syntax.word.format(f"v{next(self._count)}")
+        text = self._syntax.truth if truth else self._syntax.number
+        self.lines.append(indent + text.format(word, expression))
+        return word
+
+    def _write_loop(self, node: Node, inside: frozenset[int], indent: str) -> None:
+        syntax, words, count = self._syntax, self.words, len(node.args) // 2
+        begin, test, after = node.args[:count], node.args[count], node.args[count + 1 :]
+        names = [_carried_word(node.value, k) for k in range(count)]
+        for k, (name, first) in enumerate(zip(names, begin, strict=True)):
+            words[node.graph.carried(node.value, k)] = name
+            self.lines.append(indent + syntax.carried.format(name, words[first]))
+        within_it, deeper = inside | {node.value}, indent + "    "
+        self.lines.append(indent + syntax.loop[0])
+        self._write({*needed([test])}, within_it, deeper)
+        self.lines += [indent + line for line in syntax.loop[1].format(words[test]).splitlines()]
+        self._write({*needed(after)}, within_it, deeper)
+        changed = [(k, a) for k, a in enumerate(after) if a.value != (node.value, k)]
+        # What takes the place of another number is read before that is replaced.
+        ready = [
+            self._assign(deeper, words[a]) if a.op == "carried" else words[a] for _, a in changed
+        ]
+        for (k, _), word in zip(changed, ready, strict=True):
+            self.lines.append(deeper + syntax.again.format(names[k], word))
+        self.lines += [indent + line for line in syntax.loop[2].splitlines()]
+
+
+def _carried_word(loop: int, place: int) -> str:
+    return f"loop{loop}_{place}"
 
 
 # ---- C99 -----------------------------------------------------------------------------------------
@@ -256,6 +344,9 @@ def _c_syntax(bits: int) -> Syntax:
         "    const law_real {word} = {name}[{place}];",
         "    const law_real {} = {};",
         "    const int {} = {};",
+        "    law_real {} = {};",
+        "    {} = {};",
+        ("    for (;;) {", "        if (!{})\n            break;", "    }"),
         {name: Template(text).substitute(words) for name, text in _C_HELPERS.items()},
     )
 
@@ -324,7 +415,8 @@ def _c_head(function: LawFunction) -> str:
 
 
 def _c_function(function: LawFunction, syntax: Syntax) -> str:
-    lines, words = statements(function, syntax)
+    written = Statements(function, syntax)
+    lines, words = written.lines, written.words
     read = {node.value[0] for node in words if node.op == "leaf"}
     unread = [name for name in function.inputs if name not in read]
     valid = None if function.valid is None else words[function.valid]
@@ -448,6 +540,9 @@ _PYTHON = Syntax(
     "    {word} = {name}[{place}]",
     "    {} = {}",
     "    {} = {}",
+    "    {} = {}",
+    "    {} = {}",
+    ("    while True:", "        if not {}:\n            break", ""),
     _PYTHON_HELPERS,
 )
 
@@ -463,7 +558,8 @@ def python_text(
 
 
 def _python_function(function: LawFunction) -> str:
-    lines, words = statements(function, _PYTHON)
+    written = Statements(function, _PYTHON)
+    lines, words = written.lines, written.words
     head = f"def {function.name}({', '.join(function.inputs)}):"
     outputs = [f"[{', '.join(words[n] for n in part)}]" for part in function.outputs.values()]
     valid = [] if function.valid is None else [words[function.valid]]

@@ -1,7 +1,7 @@
 """A function for JAX as a graph of scalar operations."""
 
 from echelon.simulation.scalars.lowering import lower
-from echelon.simulation.scalars.scalar_graph import Node, ScalarGraph, needed, rewritten
+from echelon.simulation.scalars.scalar_graph import Node, ScalarGraph, needed, rewritten, within
 from echelon.simulation.scalars.traced_entries import Unsupported, nodes
 from echelon.simulation.scalars.whole_numbers import may_be_exception
 
@@ -14,4 +14,5 @@ __all__ = [
     "needed",
     "nodes",
     "rewritten",
+    "within",
 ]

@@ -20,7 +20,7 @@ from echelon.core.numerics import Precision, precision
 from echelon.core.trace import error_summary
 from echelon.core.types import PyTree
 from echelon.simulation.scalars import elementary
-from echelon.simulation.scalars.scalar_graph import Entry, Node, ScalarGraph
+from echelon.simulation.scalars.scalar_graph import Entry, Node, ScalarGraph, needed, within
 from echelon.simulation.scalars.traced_entries import (
     LARGEST,
     LONGEST,
@@ -39,7 +39,7 @@ from echelon.simulation.scalars.traced_entries import (
     select,
     where,
 )
-from echelon.simulation.scalars.whole_numbers import WHOLE_NUMBERS, TypeRules
+from echelon.simulation.scalars.whole_numbers import WHOLE_NUMBERS, TypeRules, whole_range
 from echelon_ranges.jaxpr import (
     Algebra,
     Rule,
@@ -191,20 +191,82 @@ def _scan(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Ar
 
 
 def _while(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays) -> Arrays:
-    """Return the results of a loop whose end does not depend on the agents."""
+    """Return the results of a loop: round by round, or a loop of the graph if its end differs."""
     params = equation.params
     tests, bodies = params["cond_nconsts"], params["body_nconsts"]
     test_consts, body_consts = operands[:tests], operands[tests : tests + bodies]
     carry, test, body = operands[tests + bodies :], params["cond_jaxpr"], params["body_jaxpr"]
+
+    def going(carry: Arrays) -> np.ndarray:
+        return walk(test.jaxpr, test.consts, [*test_consts, *carry], algebra)[0]
+
+    def after(carry: Arrays) -> Arrays:
+        return walk(body.jaxpr, body.consts, [*body_consts, *carry], algebra)
+
     for _ in range(LONGEST + 1):
-        [more] = walk(test.jaxpr, test.consts, [*test_consts, *carry], algebra)
+        more = going(carry)
         if more.dtype == object:
             break
         if not more:
             return carry
-        carry = walk(body.jaxpr, body.consts, [*body_consts, *carry], algebra)
-    reason = f"depends on the agent, or is more than {LONGEST} rounds away"
-    raise Unsupported(f"a `while` loop whose end {reason}{where(equation)}")
+        carry = after(carry)
+    if graph.loops is None:
+        reason = f"depends on the agent, or is more than {LONGEST} rounds away"
+        raise Unsupported(f"a `while` loop whose end {reason}{where(equation)}")
+    return _looped(graph, equation, carry, going, after)
+
+
+def _looped(
+    graph: ScalarGraph,
+    equation: JaxprEqn,
+    carry: Arrays,
+    going: Callable[[Arrays], np.ndarray],
+    after: Callable[[Arrays], Arrays],
+) -> Arrays:
+    """Return the results of a loop of the graph; truths are carried as numbers."""
+    assert graph.loops is not None
+    types, loop = [array_type(v) for v in equation.outvars], graph.loops
+    graph.loops += 1
+
+    def flat(arrays: Arrays) -> list[Node]:
+        return [node(graph, number(graph, e)) for x in arrays for e in np.asarray(x).flat]
+
+    def shaped(entries: Sequence[Node]) -> Arrays:
+        left = iter(entries)
+        rows = [[_carried(graph, next(left), t.dtype) for _ in range(t.size)] for t in types]
+        return [np.array(r, object).reshape(t.shape) for r, t in zip(rows, types, strict=True)]
+
+    begin = flat(carry)
+    inner = [graph.carried(loop, k) for k in range(len(begin) + 1)]
+    [test], last = nodes(graph, going(shaped(inner))), flat(after(shaped(inner)))
+    found = [n for n in needed([test, *last]) if n in graph.exceptions]
+    changes = within(loop, [test, *last, *(graph.exceptions[n] for n in found)])
+    found = [n for n in found if changes[graph.exceptions[n]]]
+    if set(found).intersection(needed([test])):
+        raise Unsupported(f"a `while` loop whose end may be inaccurate{where(equation)}")
+    results = graph.loop(loop, begin, test, last)
+    if found:
+        # Of a round that is not what JAX computes all later ones make something else.
+        truths = [_truth(graph, inner[-1]), *(graph.exceptions.pop(n) for n in found)]
+        wrong = functools.reduce(functools.partial(graph.make, "or"), truths)
+        last = [*last, node(graph, number(graph, wrong))]
+        *results, wrong = graph.loop(loop, [*begin, graph.constant(0.0)], test, last)
+        for result in results:
+            graph.except_where(result, _truth(graph, wrong))
+    return shaped(results)
+
+
+def _truth(graph: ScalarGraph, carried: Node) -> Node:
+    return graph.make("ne", carried, 0.0)
+
+
+def _carried(graph: ScalarGraph, entry: Node, kind: np.dtype) -> Node:
+    """Return a number that a loop carries as an entry of a type."""
+    if np.dtype(kind).kind == "b":
+        return _truth(graph, entry)
+    if np.dtype(kind).kind in "iu":
+        graph.ranges[entry] = whole_range(graph, kind)
+    return entry
 
 
 # ---- small systems of linear equations -----------------------------------------------------------
@@ -219,6 +281,9 @@ def solve(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Ar
     if len(b) != 1:
         raise Unsupported(f"`custom_linear_solve` of several vectors{where(equation)}")
     [right] = b
+    # Of a group without agents.
+    if not right.size:
+        return [right]
     columns = []
     for k in range(right.size):
         unit = np.zeros(right.size)

@@ -78,9 +78,9 @@ class Node:
     Attributes:
         graph: that it belongs to.
         number: its place; operands come before results.
-        op: a key of `OPERATIONS`, `constant` or `leaf`.
+        op: a key of `OPERATIONS`, `constant` or `leaf`; of a loop, `carried`, `loop` or `result`.
         args: its operands.
-        value: the number of a constant, the name of a leaf.
+        value: the number of a constant, the name of a leaf; which loop, which of its numbers.
         uniform: whether it is the same for all agents.
         truth: whether it is true or false, and not a number.
         at_least_0: whether it is certainly not below 0; it may be NaN, or -0.
@@ -155,12 +155,14 @@ class ScalarGraph:
 
     Attributes:
         bits: 64 or 32, the precision of the code that is generated from it.
+        loops: how many loops it has, whose ends depend on numbers; None where it may have none.
         exceptions: node -> a truth; where it holds, the node is not what JAX computes.
         ranges: node -> the least and the largest number that it may be.
     """
 
-    def __init__(self, bits: int = 64) -> None:
+    def __init__(self, bits: int = 64, loops: bool = False) -> None:
         self.bits, self.nodes, self._verbatim = bits, list[Node](), False
+        self.loops = 0 if loops else None
         self.exceptions = dict[Node, Node]()
         self.ranges = dict[Node, tuple[float, float]]()
         self._by_key: dict[Hashable, Node] = {}
@@ -207,6 +209,31 @@ class ScalarGraph:
             args = args[::-1]
         return self._once((op, *[a.number for a in args]), op, args)
 
+    def carried(self, loop: int, place: int) -> Node:
+        """Return a number that a loop carries from round to round."""
+        return self._once(("carried", loop, place), "carried", (), (loop, place), uniform=False)
+
+    def loop(
+        self, loop: int, begin: Sequence[Node], test: Node, after: Sequence[Node]
+    ) -> list[Node]:
+        """Return what the numbers of a loop are at last, which are `begin` at first.
+
+        As long as `test` holds they become `after`. Both are nodes of this graph, which depend on
+        what the loop carries.
+        """
+        args = (*begin, test, *after)
+        key = ("loop", loop, *[a.number for a in args])
+        node = self._once(key, "loop", args, loop, uniform=False)
+        results = range(len(begin))
+        return [self._once(("result", node.number, k), "result", (node,), k) for k in results]
+
+    def again(self, node: Node, args: Sequence[Node]) -> Node:
+        """Return a node with other operands."""
+        if node.op not in ("loop", "result"):
+            return self.make(node.op, *args)
+        key = (node.op, node.value, *[a.number for a in args])
+        return self._once(key, node.op, tuple(args), node.value)
+
     def _once(
         self,
         key: Hashable,
@@ -245,6 +272,16 @@ def needed(results: Iterable[Node]) -> list[Node]:
     return sorted(reached, key=lambda node: node.number)
 
 
+def within(loop: int, results: Iterable[Node]) -> dict[Node, bool]:
+    """Return of each node that results depend on whether it changes from round to round."""
+    inside = dict[Node, bool]()
+    for node in needed(results):
+        carried = node.op == "carried" and node.value[0] == loop
+        own = node.op == "loop" and node.value == loop
+        inside[node] = carried or not own and any([inside[a] for a in node.args])
+    return inside
+
+
 Instead: TypeAlias = Callable[[Node, Sequence[Node]], Node | float | bool | None]
 """(node, its new operands) -> its replacement; None if the operation stays."""
 
@@ -260,7 +297,7 @@ def rewritten(results: Iterable[Node], instead: Instead) -> dict[Node, Node]:
         elif not args:
             after[node] = node
         else:
-            after[node] = node.graph.make(node.op, *args)
+            after[node] = node.graph.again(node, args)
             after[node].verbatim |= node.verbatim
     return after
 

@@ -78,6 +78,12 @@ _RANGES: dict[str, Callable[..., _Range]] = {
 """The range of a result by those of the operands."""
 
 
+def whole_range(graph: ScalarGraph, kind: np.dtype) -> tuple[float, float]:
+    """Return the range of whole numbers of a type that are exact."""
+    limits, exact = np.iinfo(kind), _EXACT[graph.bits]
+    return max(float(limits.min), -exact), min(float(limits.max), exact)
+
+
 def may_be_exception(graph: ScalarGraph, node: Node, size: float) -> bool:
     """Tell whether a node may not be what JAX computes, if no leaf is larger than a size."""
     truth, ranges = graph.exceptions[node], dict(graph.ranges)
@@ -155,6 +161,8 @@ _PARTIAL = {"reduce_sum", "cumsum", "reduce_prod", "cumprod", "dot_general", "in
 
 def _is_well_typed(node: Node) -> bool:
     truths = [a.truth for a in node.args]
+    if node.op == "loop":
+        return True
     if node.op == "select":
         return truths[0] and truths[1] == truths[2]
     return all(truths) if node.op in LOGICAL else not any(truths)
@@ -187,8 +195,9 @@ def _truncated(graph: ScalarGraph, e: Entry, to: np.dtype) -> Node:
     towards = select(graph, graph.make("eq", entry(e), entry(e)), towards, 0.0)
     least, most = (float(end) for end in (np.iinfo(to).min, np.iinfo(to).max))
     whole = graph.make("min", graph.make("max", towards, least), most)
-    # Not by its operands, which are any numbers.
-    graph.ranges[whole] = least, most
+    # Not by its operands alone, which are any numbers, but often within less.
+    low, high = range_of(node(graph, e))
+    graph.ranges[whole] = max(least, min(low, 0.0)), min(most, max(high, 0.0))
     return whole
 
 

@@ -7,6 +7,7 @@ clock counts seconds.
 import dataclasses
 from typing import NamedTuple, final
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +15,7 @@ from jaxtyping import Float
 
 from echelon.agents.network.channel import NEVER
 from echelon.agents.network.exchange import Exchange, Near
+from echelon.agents.network.switching import ROUNDED, Schedule
 from echelon.core.types import Array, PyTree, Scalar, State, States
 from echelon.simulation.step.leadership import FixedLeaders
 from echelon.simulation.step.loop import IdealNetwork, Loop, NobodyNear, Turns
@@ -21,14 +23,20 @@ from echelon.simulation.step.nearby import ExactHulls, all_hulls
 from echelon.simulation.step.networks import LateNetwork
 from echelon.simulation.step.records import (
     AgentOutput,
+    ComponentMemory,
+    Control,
     Known,
     LawMemories,
     LeaderSpeech,
+    LoopState,
     Messages,
     NetworkEstimate,
     Played,
+    Seconds,
 )
 from echelon.simulation.step.roster import Everybody, Links
+from echelon.simulation.step.run_laws import has_angles
+from echelon.simulation.step.sequence import begin, control, hear
 from echelon.simulation.step.turns import BackupsToo, Relay, follow, lead
 
 
@@ -42,8 +50,8 @@ class Arrived(NamedTuple):
         hulls: (L, r, d) of all others; no rows where agents do not keep apart.
     """
 
-    signals: Float[Array, "K s"]
-    forward: Float[Array, " k"]
+    signals: Float[Array | jax.Array, "K s"]
+    forward: Float[Array | jax.Array, " k"]
     messages: PyTree = ()
     hulls: PyTree = ()
 
@@ -86,34 +94,57 @@ def sent_or_alone(
 class ReceivingLate(LateNetwork):
     """The rules of a late network; its medium is the real one, and no part of the computation.
 
-    It remembers the message that was written last, and the mail.
+    It remembers the message that was written last, and the newest packet of a leader.
     """
 
     arrived: Arrived
 
     def begin(self, loop: Loop, said: Float[jax.Array, "N s"], forward: int) -> PyTree:
-        """Return the mail before the first message, with stamps in s."""
-        mail = super().begin(loop, said, forward)[1]
-        packet = mail.packet._replace(stamp=mail.packet.stamp.astype(float))
-        mail = mail._replace(stamp=mail.stamp.astype(float), packet=packet)
-        return Messages(said, jnp.zeros(1, jnp.int32), packet), mail
+        """Return that it has no packet, with stamps in s."""
+        packet = super().begin(loop, said, forward)[1].packet
+        return (packet._replace(stamp=packet.stamp.astype(float)),)
 
-    def arriving(
-        self, in_flight: PyTree, step: jax.Array, mail: Messages, links: Exchange
-    ) -> tuple[Messages, jax.Array, jax.Array]:
-        """Return what came; whatever came before is the same again."""
-        received = jax.tree.map(jnp.asarray, self.arrived.messages)
-        return received, received.stamp != NEVER, received.stamp
+    def receive(self, loop: Loop, memory: PyTree, known: Known) -> tuple[NetworkEstimate, PyTree]:
+        """Return what the agent knows, and the mail; whatever came before is the same again."""
+        *_, before = memory
+        mail: Messages = jax.tree.map(jnp.asarray, self.arrived.messages)
+        leadership, new = self.rules.leadership, mail.stamp != NEVER
+        packet = leadership.newest(before, mail.packet, new, known.links)
+        since, clock = loop.roster.since(known.clock.step), known.clock
+        packet = leadership.elect(packet, known.own.number, clock, since, known.here)
+        mail = mail._replace(packet=packet)
+        return self.rules.read(loop, mail, known), mail
 
-    def posted(
-        self, in_flight: PyTree, step: jax.Array, sent: Messages, sends: jax.Array, links: Exchange
-    ) -> PyTree:
-        """Return what the agent writes."""
-        return sent
+    def send(self, loop: Loop, memory: PyTree, known: Known, speech: LeaderSpeech) -> PyTree:
+        """Return what the agent writes, and the packet that it has."""
+        written = self.written(loop, memory, known, speech)[0]
+        return written, memory.packet
 
     def another(self, memory: PyTree, heard: NetworkEstimate) -> tuple[jax.Array, jax.Array]:
         """Return a signal (s,) of another agent that this one knows, and whether it knows any."""
-        return self.rules.content.another(memory[1], heard)
+        return self.rules.content.another(memory, heard)
+
+
+# ---- whom it hears -------------------------------------------------------------------------------
+
+
+@final
+class LinksByTime(Links):
+    """Links whose weights switch, with a row of weights from each of some times (s) on.
+
+    Attributes:
+        starts: these times.
+        period: after which the rows repeat, s; None where the last one holds for ever.
+    """
+
+    starts: Array
+    period: float | None = eqx.field(static=True)
+
+    def at(self, step: jax.Array) -> Exchange:
+        """Return the exchange with the weights of a time (s)."""
+        t = step + ROUNDED
+        t = t if self.period is None else t % self.period
+        return self.exchange.during((jnp.asarray(self.starts) <= t).sum() - 1)
 
 
 # ---- who is near ---------------------------------------------------------------------------------
@@ -185,8 +216,11 @@ class OnlyFollows(Turns):
 # ---- the loop ------------------------------------------------------------------------------------
 
 
-def alone(loop: Loop, number: int, arrived: Arrived) -> Loop:
-    """Return the loop of one agent of a formation: one row of each member."""
+def alone(loop: Loop, number: int, arrived: Arrived, schedule: Schedule | None) -> Loop:
+    """Return the loop of one agent of a formation: one row of each member.
+
+    `schedule` is that of a graph that switches.
+    """
     own, laws = slice(number, number + 1), loop.laws
     first, none = np.array([0]), np.array([], int)
     leads = number in np.asarray(laws.leaders)
@@ -198,6 +232,9 @@ def alone(loop: Loop, number: int, arrived: Arrived) -> Loop:
     mine = np.asarray(exchange.receivers) == number
     senders, weights = np.arange(mine.sum()), np.asarray(exchange.weights)[..., mine]
     links = Exchange(np.zeros(mine.sum(), int), senders, weights)
+    graph = Links(links)
+    if schedule is not None:
+        graph = LinksByTime(links, schedule.starts, schedule.period)
     leadership: FixedLeaders = dataclasses.replace(
         network.leadership, first=np.asarray(network.leadership.first)[own]
     )
@@ -217,7 +254,7 @@ def alone(loop: Loop, number: int, arrived: Arrived) -> Loop:
         laws=laws,
         sensing=loop.sensing.on_board,
         places=loop.places.of_one(number),
-        graph=Links(links),
+        graph=graph,
         network=network,
         surroundings=near,
         turns=turns,
@@ -226,13 +263,67 @@ def alone(loop: Loop, number: int, arrived: Arrived) -> Loop:
     )
 
 
-def after_mail(loop: Loop, arrived: Arrived, weights: Float[Array, " K"]) -> Loop:
-    """Return the loop of one agent with what came, and the weights of its links."""
-    links, near = loop.graph.exchange, loop.surroundings
+def after_mail(loop: Loop, arrived: Arrived) -> Loop:
+    """Return the loop of one agent with what came."""
+    near = loop.surroundings
     if isinstance(near, ReceivedHulls):
         near = dataclasses.replace(near, arrived=arrived)
-    return loop.replace(
-        network=dataclasses.replace(loop.network, arrived=arrived),
-        surroundings=near,
-        graph=Links(Exchange(links.receivers, links.senders, weights)),
-    )
+    network = dataclasses.replace(loop.network, arrived=arrived)
+    return loop.replace(network=network, surroundings=near)
+
+
+# ---- the step ------------------------------------------------------------------------------------
+
+
+class OwnMemory(NamedTuple):
+    """What an agent alone remembers between two steps.
+
+    Attributes:
+        components: of these; what it said is no part of it.
+        begun: when it first acted, s; infinite before.
+        asks: whether it has yet to learn how often others turned.
+    """
+
+    components: ComponentMemory
+    begun: jax.Array
+    asks: jax.Array
+
+    @classmethod
+    def of(cls, memory: ComponentMemory, begun: jax.Array, asks: jax.Array) -> "OwnMemory":
+        """Return what an agent needs of the memory after a step."""
+        kept = memory._replace(plant=(), near=(), network=memory.network[-1:])
+        return cls(kept, begun, asks)
+
+
+def begin_alone(loop: Loop, x: State) -> OwnMemory:
+    """Return the memory of an agent that begins at x."""
+    memory = begin(loop, x[None]).memory
+    return OwnMemory.of(memory, jnp.asarray(jnp.inf, x.dtype), jnp.asarray(False))
+
+
+def step_alone(loop: Loop, own: OwnMemory, t: jax.Array, x: State) -> tuple[Control, OwnMemory]:
+    """Return what an agent at x does at a time (s), and its memory after it."""
+    first, begun = own.begun == jnp.inf, jnp.minimum(own.begun, t)
+    clock = Seconds(t, loop.motion.dt, begun, first)
+    cut = jnp.zeros((1, len(loop.model.input_names)), jnp.int8)
+    now, asks = LoopState(jnp.zeros((), jnp.int32), x[None], cut, own.components), own.asks
+    if has_angles(loop.laws.follower):
+        # An angle is a number that grows with every turn, and who begins late knows none of them:
+        # it takes them from another's signal.
+        asks = asks | first & (t > 0.0)
+        laws, asks = jax.lax.cond(
+            asks,
+            lambda: _beside_others(loop, now, clock),
+            lambda: (now.memory.laws, jnp.asarray(False)),
+        )
+        now = now._replace(memory=now.memory._replace(laws=laws))
+    acted = control(loop, now, clock)
+    return acted, OwnMemory.of(acted.memory, begun, asks)
+
+
+def _beside_others(loop: Loop, now: LoopState, clock: Seconds) -> tuple[LawMemories, jax.Array]:
+    """Return the memory beside another's signal, and whether no signal came."""
+    known, _, network = hear(loop, now, clock)
+    assert isinstance(loop.network, ReceivingIdeally | ReceivingLate), "it is alone"
+    other, there = loop.network.another(network, known.heard)
+    return loop.laws.beside(now.memory.laws, there[None], other), ~there

@@ -67,8 +67,9 @@ class Leadership:
             )
 
 
-NOBODY = 2**30
-"""The leader of an agent that has no packet, and more hops than any agent has."""
+NOBODY = 2**23
+"""The leader of an agent that has no packet, and more hops than any agent has; one more of it is
+exact in single precision."""
 
 
 class FixedLeaders(eqx.Module):
@@ -141,7 +142,7 @@ class FixedLeaders(eqx.Module):
         stamp = links.most(jnp.where(of_it, others.stamp, NEVER), count)
         stamp = jnp.maximum(last, stamp)
         latest = of_it & (others.stamp == stamp[receivers])
-        places = jnp.where(latest, jnp.arange(len(receivers)), NEVER)
+        places = jnp.where(latest, jnp.arange(len(receivers)), -1)
         place = links.most(places, count)
         better = (place >= 0) & (stamp > last)
         content = jnp.where(better[:, None], others.content[place], own.content)

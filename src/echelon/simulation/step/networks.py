@@ -496,27 +496,27 @@ class LateNetwork(IdealNetwork):
         here: Mask,
     ) -> Messages:
         """Return the mail with what arrives now, and with who takes the lead."""
-        mail = self.rules.take(mail, *self.arriving(in_flight, clock.step, mail, links), links)
-        packet = self.leadership.elect(mail.packet, number, clock, since, here)
-        return mail._replace(packet=packet)
-
-    def arriving(
-        self, in_flight: PyTree, step: jax.Array, mail: Messages, links: Exchange
-    ) -> tuple[Messages, jax.Array, jax.Array]:
-        """Return a message of each link (K, ...), which of them arrives now, and its stamp."""
-        arrival = self.medium.arrivals(in_flight, step, mail.stamp)
+        arrival = self.medium.arrivals(in_flight, clock.step, mail.stamp)
         places = arrival.slot, jnp.asarray(links.senders)
         sent: Messages = jax.tree.map(lambda rows: rows[places], in_flight.content)
-        return sent, arrival.new, arrival.stamp
+        mail = self.rules.take(mail, sent, arrival.new, arrival.stamp, links)
+        packet = self.leadership.elect(mail.packet, number, clock, since, here)
+        return mail._replace(packet=packet)
 
     def send(self, loop: Loop, memory: PyTree, known: Known, speech: LeaderSpeech) -> PyTree:
         """Return the network after what agents send now."""
         in_flight, mail = memory
+        sent, sends = self.written(loop, mail, known, speech)
+        return self.posted(in_flight, known.clock.step, sent, sends, known.links), mail
+
+    def written(
+        self, loop: Loop, mail: Messages, known: Known, speech: LeaderSpeech
+    ) -> tuple[Messages, Bool[jax.Array, " N"]]:
+        """Return what agents write, and which of them can."""
         content = self.rules.contents(loop, mail, known, speech)
-        clock, difference = known.clock, loop.laws.speech.difference(loop.model)
-        rows = known.own.number, clock.now, known.said, content, difference
-        sent, sends = self.rules.write(mail, known.heard, *rows)
-        return self.posted(in_flight, clock.step, sent, sends, known.links), mail
+        difference = loop.laws.speech.difference(loop.model)
+        rows = known.own.number, known.clock.now, known.said, content, difference
+        return self.rules.write(mail, known.heard, *rows)
 
     def with_medium(self, medium: Channel) -> IdealNetwork:
         """Return the network over another medium."""
