@@ -304,7 +304,13 @@ class Channel(eqx.Module):
             out: jax.Array, i: jax.Array, j: jax.Array
         ) -> tuple[jax.Array, jax.Array, jax.Array]:
             # By receiver and sender, and not by the link's place: no other edge changes a draw.
-            late = jnp.floor(uniform(self.key, Draw.JITTER, number, i, j) * (self.jitter + 1))
+            # Without jitter nothing is drawn, which takes as long as all else.
+            drawn = jax.lax.cond(
+                self.jitter > 0,
+                lambda: uniform(self.key, Draw.JITTER, number, i, j),
+                lambda: jnp.zeros(()),
+            )
+            late = jnp.floor(drawn * (self.jitter + 1))
             lost = uniform(self.key, Draw.LOSS, number, i, j) < self.loss
             if self.bursty:
                 stays = jnp.where(out, 1.0 - self.ends, self.begins)

@@ -291,6 +291,10 @@ class AllNeighbours(eqx.Module):
         """Return which links (K,) an agent uses whose messages are fresh."""
         return True
 
+    def weights(self, links: Exchange, fresh: jax.Array) -> Float[jax.Array, " K"]:
+        """Return the weights of links (K,) in the sums of differences, of which some are fresh."""
+        return jnp.asarray(links.weights, float)
+
     def disagreement(
         self, known: Known, received: jax.Array, fresh: jax.Array, alone: jax.Array, loop: Loop
     ) -> Float[jax.Array, "N s"]:
@@ -381,13 +385,20 @@ class MessageRules(eqx.Module):
         leader = jnp.where((itself | ~aware)[:, None], known.said, leader)
         forward = jnp.where(aware[:, None], forward, 0.0)
         hops, knows = self.hops(mail, age, leads, links, clock.dt), leads | aware
-        received, used, fresh = self.content.received(mail, age, leader, knows, known)
-        received = jnp.where(used[:, None], received, known.said[jnp.asarray(links.receivers)])
-        fresh = fresh & used & self.neighbours.uses(mail, hops, links)
+        received, fresh = self.received(mail, age, leader, knows, known)
+        fresh = fresh & self.neighbours.uses(mail, hops, links)
         off = loop.laws.speech.difference(loop.model)(known.said, leader)
         alone = jnp.where(knows[:, None], off, 0.0)
         z = self.neighbours.disagreement(known, received, fresh, alone, loop)
         return NetworkEstimate(z, leads, forward, leader, hops, packet)
+
+    def received(
+        self, mail: Messages, age: jax.Array, leader: jax.Array, knows: jax.Array, known: Known
+    ) -> tuple[Float[jax.Array, "K s"], Bool[jax.Array, " K"]]:
+        """Return the signal of the sender of each link, the own one of none, and which is fresh."""
+        received, used, fresh = self.content.received(mail, age, leader, knows, known)
+        own = known.said[jnp.asarray(known.links.receivers)]
+        return jnp.where(used[:, None], received, own), fresh & used
 
     def hops(
         self,
@@ -496,7 +507,21 @@ class LateNetwork(IdealNetwork):
         here: Mask,
     ) -> Messages:
         """Return the mail with what arrives now, and with who takes the lead."""
-        mail = self.rules.take(mail, *self.arriving(in_flight, clock.step, mail, links), links)
+        arriving = self.arriving(in_flight, clock.step, mail, links)
+        return self.taken(mail, arriving, number, clock, since, links, here)
+
+    def taken(
+        self,
+        mail: Messages,
+        arriving: tuple[Messages, jax.Array, jax.Array],
+        number: jax.Array,
+        clock: Clock,
+        since: jax.Array,
+        links: Exchange,
+        here: Mask,
+    ) -> Messages:
+        """Return the mail with what is arriving, and with who takes the lead."""
+        mail = self.rules.take(mail, *arriving, links)
         packet = self.leadership.elect(mail.packet, number, clock, since, here)
         return mail._replace(packet=packet)
 
