@@ -291,10 +291,6 @@ class AllNeighbours(eqx.Module):
         """Return which links (K,) an agent uses whose messages are fresh."""
         return True
 
-    def weights(self, links: Exchange, fresh: jax.Array) -> Float[jax.Array, " K"]:
-        """Return the weights of links (K,) in the sums of differences, of which some are fresh."""
-        return jnp.asarray(links.weights, float)
-
     def disagreement(
         self, known: Known, received: jax.Array, fresh: jax.Array, alone: jax.Array, loop: Loop
     ) -> Float[jax.Array, "N s"]:
