@@ -109,11 +109,12 @@ class Draws:
         return NamedValues(tuple(names), size * self.draws.normal(size=len(names)))
 
     def hull(self, sender):
-        """Points about a place of each sender, that is near the agent's own at times."""
+        """Points about a place that is as near as agents come that keep apart, or farther."""
         if not self.hull_names:
             return None
         d = len(self.own.loop.model.position)
-        place = self.draws.normal(size=d) + np.resize([0.3 * sender, 0.3], d)
+        angle, far = self.draws.uniform(0.0, 2.0 * math.pi), self.draws.uniform(0.7, 3.0)
+        place = np.resize([far * math.cos(angle), far * math.sin(angle), 0.1], d)
         points = place + 0.1 * self.draws.normal(size=(len(self.hull_names) // d, d))
         return NamedValues(self.hull_names, points.ravel())
 
