@@ -92,6 +92,17 @@ class Draws:
         self.sizes, self.senders = message_sizes(self.own), senders_of(self.own)
         self.hull_names = hull_names(self.own)
         self.trim = np.array(self.own.loop.model.trim[0], float)
+        # What the agent said last, about which others are.
+        self.said, self.place = 0.0, 0.0
+
+    def flies(self, row):
+        """Put others about an agent that flies, by its last message."""
+        ends = dict(zip(self.sizes, itertools.accumulate(self.sizes.values())))
+        if "time" not in self.sizes:
+            self.said = np.array(row[: ends["signal"]])
+        if self.hull_names and not math.isnan(row[-1]):
+            d = len(self.own.loop.model.position)
+            self.place = np.reshape(row[-len(self.hull_names) :], (-1, d)).mean(axis=0)
 
     def state(self, k):
         return self.trim + self.size * self.draws.normal(size=len(self.trim)) * (k > 0)
@@ -109,18 +120,20 @@ class Draws:
         return NamedValues(tuple(names), size * self.draws.normal(size=len(names)))
 
     def hull(self, sender):
-        """Points about a place of each sender, that is near the agent's own at times."""
+        """Points about a place that is as near as agents come that keep apart, or farther."""
         if not self.hull_names:
             return None
         d = len(self.own.loop.model.position)
-        place = self.draws.normal(size=d) + np.resize([0.3 * sender, 0.3], d)
-        points = place + 0.1 * self.draws.normal(size=(len(self.hull_names) // d, d))
+        angle, far = self.draws.uniform(0.0, 2.0 * math.pi), self.draws.uniform(0.7, 3.0)
+        place = np.resize([far * math.cos(angle), far * math.sin(angle), 0.1], d)
+        points = self.place + place + 0.1 * self.draws.normal(size=(len(self.hull_names) // d, d))
         return NamedValues(self.hull_names, points.ravel())
 
     def ideal(self, sender):
         own = self.own
         forward = self.normal(own.forward_names, 0.1) if sender == own.source else None
         signal = self.normal(own.signal_names, 0.3)
+        signal = signal._replace(values=self.said + signal.values)
         return ech.Message(sender, signal, forward, hull=self.hull(sender))
 
     def late(self, sender, time):
@@ -138,8 +151,8 @@ class Draws:
         return ech.Message(sender, signal, None, time, hops, packet, self.hull(sender))
 
 
-def compare(agent, laws, steps, dt, size=0.1, terms=1.0):
-    """Let an agent and copies of its law take the same random steps; returns their memories.
+def compare(agent, laws, steps, dt, size=0.1, terms=1.0, move=None):
+    """Let an agent and copies of its law take the same steps; returns their memories.
 
     Args:
         agent: in any network.
@@ -148,10 +161,12 @@ def compare(agent, laws, steps, dt, size=0.1, terms=1.0):
         dt: between two, s; the law's own, or longer to see more of its time.
         size: of the random states.
         terms: the largest of which a number of the step is the sum.
+        move: how its vehicle moves under the inputs; without it all states are random.
     """
     draws, plain, sent = Draws(agent, size), [PlainAgent(agent.own_law, law) for law in laws], 0
+    motors = list(map(float, agent.own_law.loop.model.trim[1]))
     for k in range(steps):
-        t, x = k * dt, draws.state(k)
+        t, x = k * dt, draws.state(k) if move is None or k == 0 else np.array(x)
         for message in draws.messages(k, t):
             if str(agent.receive(message)) == "taken":
                 for one in plain:
@@ -170,6 +185,9 @@ def compare(agent, laws, steps, dt, size=0.1, terms=1.0):
             # The input is a sum of terms as large as the own deviation.
             off = [] if message is None or "time" not in draws.sizes else message.signal.values
             check(ours, u, max([1.0, *np.abs(off)]), terms)
+        if move is not None:
+            draws.flies(numbers)
+            x, motors = move(x.tolist(), ours, motors, [0.0] * len(x))
     assert sent > steps // 2
     return [one.memory for one in plain]
 

@@ -6,7 +6,11 @@ from test_onboard import as_compiled_c
 
 import echelon as ech
 from echelon.experiments.scenario.scenario import bundled_scenarios
-from echelon.simulation.onboard.agent_functions import agent_functions
+from echelon.simulation.onboard.agent_functions import (
+    agent_functions,
+    motions_of,
+    move_function,
+)
 
 CHANGES = {
     "reshape, turning": (
@@ -53,8 +57,11 @@ def test_the_law_of_an_agent_is_the_agents(name, leads):
 @pytest.mark.outside
 @pytest.mark.parametrize(("name", "leads"), BOTH)
 def test_it_still_is_after_ten_thousand_steps_and_c_is_python(name, leads, tmp_path):
+    """In flight, since the memory of an agent that is put here and there grows without end."""
     agent, settings, terms = flown(name, leads)
+    [motion] = motions_of(agent._loop.motion, 1, 1)
+    move = as_python([move_function(motion)])["move"]
     functions = agent_functions(agent.own_law).values()
     laws = as_python(functions), as_compiled_c(functions, tmp_path)
-    memories = compare(agent, laws, MANY, settings.dt, terms=terms)
+    memories = compare(agent, laws, MANY, settings.dt, terms=terms, move=move)
     assert memories[0] == memories[1]
