@@ -243,8 +243,8 @@ def test_a_file_that_is_no_mapping_is_refused(fault_of, tmp_path):
         assert str(fault_of(text)) == (
             f"{tmp_path / 's.yaml'}:1: got {got}, allowed is a mapping with the keys `name`,"
             " `model`, `plant`, `graph`, `formation`, `reference`, `leader`, `follower`,"
-            " `safety`, `initial`, `disturbance`, `actuator`, `sensing`, `network`, `events`,"
-            " `leadership`, `simulation`, `report`, `live`, `seed`."
+            " `safety`, `initial`, `disturbance`, `actuator`, `sensing`, `network`, `parts`,"
+            " `events`, `leadership`, `simulation`, `report`, `live`, `seed`."
         )
 
 
