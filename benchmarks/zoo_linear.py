@@ -158,7 +158,7 @@ def _judge_star(A: Any, B: Any, P: Any, K: Any, weights: np.ndarray, dt: float) 
         if answer.promised and radii(A, B, K, weights, 1.01 * longest).max() < 1.0:
             false.append(f"longest step {longest} is not the longest")
     if worst < 0.0:
-        false += _margins(A, B, K, weights, ech.check(parts, settings).lines)
+        false += _margins(A, B, K, weights, dt, ech.check(parts, settings).lines)
     if not answer.promised:
         return Finding(False, tuple(false), holds, answer.reasons[0][:90])
     # The rate stated is that of held steps, which is not the one of continuous time.
@@ -167,16 +167,16 @@ def _judge_star(A: Any, B: Any, P: Any, K: Any, weights: np.ndarray, dt: float) 
     return Finding(True, tuple(false), holds)
 
 
-def _margins(A: Any, B: Any, K: Any, weights: np.ndarray, lines: Any) -> list[str]:
-    """Return what is wrong with the stated margins, a little inside and a little outside."""
+def _margins(A: Any, B: Any, K: Any, weights: np.ndarray, dt: float, lines: Any) -> list[str]:
+    """Return what is wrong with the margins of held steps, a little inside and outside."""
     by_topic, false = {line.statement: line for line in lines}, list[str]()
     gain, delay = by_topic.get(Topic.GAIN), by_topic.get(Topic.DELAY)
     if gain is not None and " to " in (gain.number_text or ""):
         for factor, inside in zip(map(float, gain.number_text.split(" to ")), (1.01, 0.99)):
             if 0.0 < factor < np.inf:
-                if growth(A, B, K, inside * factor * weights).max() >= 0.0:
+                if radii(A, B, K, inside * factor * weights, dt).max() >= 1.0:
                     false.append(f"gain margin {factor} is lost inside")
-                if growth(A, B, K, (2.0 - inside) * factor * weights).max() < 0.0:
+                if radii(A, B, K, (2.0 - inside) * factor * weights, dt).max() < 1.0:
                     false.append(f"gain margin {factor} is not all")
     if delay is not None and delay.number and np.isfinite(delay.number):
         some = weights[np.unique(np.linspace(0, len(weights) - 1, 60).astype(int))]

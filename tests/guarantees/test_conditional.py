@@ -123,9 +123,12 @@ def test_motors_that_cannot_give_what_the_trim_needs_leave_nothing_guaranteed(ch
 
 
 def test_a_run_from_outside_the_set_that_stays_in_the_domain_is_covered_whatever_is_stored():
-    parts = parts_of(DOUBLE, "T1", domain={"position": 1.0, "velocity": 4.0})
-    starts = parts.formation.offsets + np.array([[0, 0, 0, 0], [0.9, 0, 0, 0], [0.9, 0, 0, 0.0]])
-    parts, short = parts.replace(initial=starts), SETTINGS._replace(horizon=0.5)
+    pendulum, goals = ech.models.Pendulum(), np.zeros((3, 2))
+    gain = ech.synthesize(pendulum, GRAPH, ech.gains.RobustLQR(domain={"angle": 1.0}))
+    laws = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain, feedforward="relay"))
+    parts = ech.Parts(pendulum, GRAPH, ech.Formation(goals), laws)
+    starts = np.array([[0.0, 0.0], [0.9, 0.0], [0.9, 0.0]])
+    parts, short = parts.replace(initial=starts), SETTINGS._replace(horizon=0.05)
     # It ends before the certified set is reached.
     assert ech.guarantee(parts, short).hypotheses[Hypothesis.STARTS].fails
     for every in (1, 5):
