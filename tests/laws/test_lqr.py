@@ -198,7 +198,10 @@ def test_a_scenario_names_a_path_of_states_by_its_file(tmp_path):
     [
         ("reference.file=none.csv", "none.csv` cannot be read"),
         ("reference={name: circle, file: swing.csv}", "`circle` does not read files"),
-        ("model={name: van-der-pol}", "lacks `position`, `velocity`, `force`, and must name each"),
+        (
+            "model={name: van-der-pol}",
+            "lacks `position`, `velocity`, `force`: it names `rate`, `t`, `angle`, `torque`",
+        ),
         ("reference={name: states, times: [0, 0], states: [[0]], inputs: [[0]]}", "increasing"),
         ("leader={law: lqr, reacts: true}", "the law `lqr` cannot react to neighbours"),
         ("reference={name: states, file: swing.csv, times: [0, 1]}", "got `file` and `times`"),

@@ -16,7 +16,7 @@ from carts import carts
 from plain_agents import Draws, PlainAgent, as_python, compare
 
 import echelon as ech
-from echelon.agents.world.sensing import Sensors, SensorStage
+from echelon.agents.world.sensing import SensorStage
 from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.onboard.agent_functions import agent_functions, move_function
 from echelon.simulation.onboard.source_code import LawFunction, c_text, header_text
@@ -313,8 +313,22 @@ class DeafNetwork(IdealNetwork):
         return super().receive(loop, memory, known._replace(said=0.0 * known.said))
 
 
+class Averaging(ech.WorldPart):
+    """A sensor on board."""
+
+    def member(self, loop):
+        return loop.with_sensor(MeanSensor())
+
+
+class Deaf(ech.WorldPart):
+    """A network of its own."""
+
+    def member(self, loop):
+        return loop.replace(network=DeafNetwork(loop.network.leadership))
+
+
 def test_a_sensor_of_your_own_that_is_on_board_is_in_the_law():
-    world = ech.World(members=lambda loop: loop.replace(sensing=Sensors((MeanSensor(),))))
+    world = ech.World(parts=[Averaging()])
     agents = [ech.Agent(carts("consensus").replace(world=w), 1, 0.01) for w in (world, ech.World())]
     sensed, exact = (
         PlainAgent(one.own_law, as_python(agent_functions(one.own_law).values())) for one in agents
@@ -328,8 +342,7 @@ def test_a_sensor_of_your_own_that_is_on_board_is_in_the_law():
 
 
 def test_a_member_of_your_own_that_an_agent_alone_does_not_have_is_refused():
-    network = lambda loop: loop.replace(network=DeafNetwork(loop.network.leadership))  # noqa: E731
-    parts = carts("consensus").replace(world=ech.World(members=network))
+    parts = carts("consensus").replace(world=ech.World(parts=[Deaf()]))
     own = ech.Agent(parts, 1, 0.01).own_law
     with pytest.raises(
         Unsupported, match=r"the member `DeafNetwork` of your own .*test_onboard.py"
