@@ -141,6 +141,25 @@ class Clipped(ech.models.DoubleIntegrator):
         return jnp.clip(u, -0.1, 0.1)
 
 
+class Weak(ech.models.Pendulum):
+    """A pendulum with a limit that no rows describe."""
+
+    def limit(self, u):
+        return jnp.clip(u, -0.02, 0.02)
+
+
+def test_a_run_inside_a_set_that_says_nothing_of_limits_is_not_covered_where_one_acts():
+    model, graph, goals = Weak(), ech.Graph.path(3), np.zeros((3, 2))
+    gain = ech.synthesize(model, graph, ech.gains.RobustLQR(domain={"angle": 1.0}))
+    laws = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain, feedforward="relay"))
+    starts = np.array([[0.0, 0.0], [0.3, 0.0], [0.3, 0.0]])
+    parts = ech.Parts(model, graph, ech.Formation(goals), laws, initial=starts)
+    found, result = ech.guarantee(parts, SETTINGS), ech.simulate(parts, SETTINGS)
+    assert found.verdict is GuaranteeVerdict.CONDITIONAL and not found.certified.stays
+    assert not found.hypotheses[Hypothesis.STARTS].fails
+    assert result.saturated.max() > 0.5 and not covered(result, found)
+
+
 @pytest.mark.parametrize("kind", [Clipped, Cart])
 def test_a_run_that_a_limit_takes_from_its_goals_is_not_guaranteed(kind):
     model, graph = kind(dimension=1) if kind is Clipped else Cart(dimension=1, most=0.1), GRAPH

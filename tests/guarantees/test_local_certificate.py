@@ -10,7 +10,8 @@ import echelon as ech
 from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis
 from echelon.core.words import Verdict
-from echelon.guarantees.local.local_certificate import Fault, local_certificate
+from echelon.guarantees.local.local_certificate import Fault, LocalCertificate, local_certificate
+from echelon.guarantees.local.local_lines import local_lines
 from echelon.simulation.engine.prepare import prepare
 
 SETTINGS = ech.Settings(horizon=2.0, dt=0.02)
@@ -260,3 +261,15 @@ def test_the_bundled_formation_has_the_rate_of_its_own_matrix():
     found = ech.guarantee(parts, settings)
     assert found.rate == pytest.approx(1.2689394572, rel=1e-9)
     assert found.hypotheses[Hypothesis.DISAGREEMENT_DECAY].verdict is Verdict.HOLDS
+
+
+@pytest.mark.parametrize("radius", [None, 0.9])
+@pytest.mark.parametrize("fault", Fault)
+def test_no_fault_leaves_a_guarantee(fault, radius):
+    """Each has a line that rules it out, whether or not a radius is known."""
+    parts, settings = ech.build(ech.load_scenario("integrators"))
+    exact = 1.1 if fault is Fault.GROWS_EXACTLY else None
+    known = radius if exact is None else 0.9
+    local = LocalCertificate((fault,), radius=known, exact=exact)
+    lines = local_lines(parts, settings, local, 0.0)
+    assert any(line.fails and line.reason for line in lines)

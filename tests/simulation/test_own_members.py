@@ -174,6 +174,21 @@ def test_of_a_member_that_counts_steps_nothing_is_guaranteed_and_machine_code_la
         ech.simulate(parts, settings._replace(engine="native"))
 
 
+def test_of_motors_that_die_nothing_is_guaranteed():
+    """A double integrator whose inputs fade keeps what is left of its errors for ever."""
+    model, graph = ech.models.DoubleIntegrator(dimension=2), ech.Graph.path(3)
+    gain = ech.synthesize(model, graph, ech.gains.Riccati())
+    laws = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain, feedforward="relay"))
+    goals, fading = ech.Formation.line(model, graph), WeakeningMotors(left=0.999)
+    world = ech.World(parts=[Driven(fading)])
+    parts = ech.Parts(model, graph, goals, laws, initial={"position": 1.0}, world=world)
+    found = ech.guarantee(parts, ech.Settings(horizon=20.0, dt=DT))
+    assert str(found.verdict) == "none", in_words(found)
+    errors = ech.simulate(parts, ech.Settings(horizon=800.0, dt=DT)).errors[:, 1:]
+    half, last = (np.abs(errors[k]).max() for k in (len(errors) // 2, -1))
+    assert 0.0 < 0.99 * half < last
+
+
 def test_a_member_whose_memory_changes_its_form_is_told_with_its_line():
     line = 1 + pathlib.Path(__file__).read_text().split("class GrowingSensor")[0].count("\n")
     where = rf"test_own_members.py:{line}: the memory of `GrowingSensor` is .*\(3, 1\) at first"

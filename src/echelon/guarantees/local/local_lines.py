@@ -92,11 +92,8 @@ def _smooth(parts: Parts, local: LocalCertificate) -> Statement:
 
 def _decays(parts: Parts, settings: Settings, local: LocalCertificate, shorter: float) -> Statement:
     name, radius = Hypothesis.DISAGREEMENT_DECAY, local.radius
-    if radius is None and Fault.LARGE not in local.faults:
-        return unneeded(name, _LINEAR, _UNKNOWN)
-    if radius is None:
-        text = "the formation is too large for one matrix, and its agents are not alike"
-        return fails(name, _LINEAR, text, remedy="take fewer agents", reason=text)
+    if radius is None or Fault.LARGE in local.faults:
+        return _undecided(local)
     rate, dt = local.rate(settings.dt), settings.dt
     shown = "" if rate is None else f"{at_least(-rate)} 1/s"
     number = None if rate is None else -rate, shown, 0.0
@@ -128,6 +125,23 @@ def _decays(parts: Parts, settings: Settings, local: LocalCertificate, shorter: 
     if local.growth is not None and local.growth > 1.0 + 1e-9:
         text += f"; before, they may grow {at_least(local.growth)} times"
     return holds(name, _LINEAR, text, *number)
+
+
+_TOLD = {Fault.TIME, Fault.WHOLE, Fault.SWITCHES, Fault.NO_REST, Fault.OFF_GOALS, Fault.KINK}
+"""What other lines tell."""
+
+
+def _undecided(local: LocalCertificate) -> Statement:
+    """Return why no radius is known; what no other line tells rules out any guarantee here."""
+    name, faults = Hypothesis.DISAGREEMENT_DECAY, {*local.faults}
+    if faults & _TOLD:
+        return unneeded(name, _LINEAR, _UNKNOWN)
+    if Fault.LARGE in faults:
+        text = "the formation is too large for one matrix, and its agents are not alike"
+        return fails(name, _LINEAR, text, remedy="take fewer agents", reason=text)
+    text = str(next(iter(local.faults), _UNKNOWN))
+    remedy = "bring the units nearer to each other, or let the slowest mode decay faster"
+    return fails(name, _LINEAR, text, remedy=remedy, reason=text)
 
 
 def _against_growth(parts: Parts) -> str:

@@ -71,7 +71,7 @@ def _against(result: Result, promise: Guarantee) -> str:
 def _inside_from(result: Result, promise: Guarantee) -> float | None:
     """Return from when (s) a run was in the certified set by its stored frames; None for never."""
     certified = promise.certified
-    if certified is None or not 0.0 < certified.radius < np.inf or result.presence is not None:
+    if certified is None or not certified.entered_for_good or result.presence is not None:
         return None
     return entered(result, certified.radius)
 

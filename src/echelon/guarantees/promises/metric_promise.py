@@ -154,8 +154,9 @@ class MetricPromise(Guarantee):
             # A region says itself where the leader may go.
             lines = [line for line in lines if line.statement is not Hypothesis.LEADER]
             radius, limits = limit_room(parts, settings, leaders, certificate)
-            lines += [held_line(parts, settings, certificate)]
-            certified = within(certified, radius)
+            held = held_line(parts, settings, certificate)
+            lines += [held]
+            certified = within(certified, radius, limits, held)
         lines += [region.line, set_line(certificate, certified)]
         enters = None if brief else entry(parts, settings, states, certified)
         lines += _of_starts(parts, states, certificate, certified, limits, enters)

@@ -295,6 +295,7 @@ class CertifiedSet(NamedTuple):
         radius: 0 where the set is empty, infinite where the domain bounds nothing.
         kind: of the argument; samples where the leader's excursion is read off a run of its own.
         by_run: whether it is.
+        stays: whether all that is inside stays, as inputs are held, with no limit acting on it.
     """
 
     radius: float
@@ -302,6 +303,12 @@ class CertifiedSet(NamedTuple):
     why: str
     remedy: str = ""
     by_run: bool = False
+    stays: bool = False
+
+    @property
+    def entered_for_good(self) -> bool:
+        """Whether a run that enters it is known from there on."""
+        return self.stays and 0.0 < self.radius < np.inf
 
     def as_mapping(self) -> dict[str, object]:
         """Return it ready for JSON, where an infinite radius is None."""
@@ -360,9 +367,17 @@ def _less(parts: Parts, region: RegionCertificate, kind: Kind, away: Array) -> C
     return CertifiedSet(float(shrink * radii[j]), kind, text)
 
 
-def within(certified: CertifiedSet | None, radius: float) -> CertifiedSet | None:
-    """Return a certified set that is no larger than one in which no limit of an input acts."""
-    if certified is None or certified.radius <= radius:
+def within(
+    certified: CertifiedSet | None, radius: float, limits: Statement, held: Statement
+) -> CertifiedSet | None:
+    """Return a certified set that is no larger than one in which no limit of an input acts.
+
+    It holds what is inside where its lines on limits and on held inputs do not fail.
+    """
+    if certified is None:
+        return None
+    certified = certified._replace(stays=not (limits.fails or held.fails))
+    if certified.radius <= radius:
         return certified
     text = "of sum_i delta_i'P delta_i <= r^2, limited by the inputs"
     remedy = "slow the reference, or strengthen the actuators"
@@ -406,7 +421,7 @@ def entry(
 
     A share of the radius is left for rounding.
     """
-    if certified is None or not 0.0 < certified.radius < np.inf or not parts.world.ideal:
+    if certified is None or not (certified.entered_for_good and parts.world.ideal):
         return None
     many = settings.steps * len(states) > _AGENT_STEPS
     if many or sizes_of(parts, states) <= certified.radius:
@@ -418,6 +433,8 @@ def entry(
 
 def entered(result: Result, radius: float) -> float | None:
     """Return the time (s) of the first stored frame in a set of some radius; None without one."""
+    if result.formation.motion is not None:
+        return None  # places are those of the start
     with np.errstate(over="ignore", invalid="ignore"):
         inside = np.flatnonzero(sizes_of(result.parts, result.states) <= radius)
     return float(result.times[inside[0]]) if len(inside) else None
