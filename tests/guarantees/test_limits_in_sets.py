@@ -9,6 +9,7 @@ from in_words import in_words
 import echelon as ech
 from echelon.core.statement import NO_LIMIT, Hypothesis
 from echelon.core.words import GuaranteeVerdict, Kind
+from echelon.experiments.results.recording import recording_of
 from echelon.guarantees.promises.coverage import covered
 from echelon.guarantees.promises.promise import promises
 
@@ -105,6 +106,10 @@ def test_starts_from_which_a_run_enters_the_set_are_covered_although_limits_act(
     assert found.hypotheses[Hypothesis.STARTS].kind is Kind.SAMPLES
     assert covered(result, found)
     assert any("run from these starts" in each for each in found.claim().premises)
+    # No rate and no bound is told from the start on.
+    seen = recording_of(result)
+    assert seen.rate is None and seen.error_bound() is None
+    assert "or faster, from there on" in in_words(found)
     # Of a run that ends before, nothing is known.
     short = settings._replace(horizon=0.5 * found.enters)
     soon = ech.guarantee(parts, short)

@@ -211,8 +211,9 @@ class Recording(FrameNumbers):
 
     @property
     def rate(self) -> float | None:
-        """The rate at which errors are guaranteed to decay, 1/s; None where none is guaranteed."""
+        """The rate at which errors are guaranteed to decay from the start, 1/s; None for none."""
         held = self.guarantee.get("verdict") == str(GuaranteeVerdict.GUARANTEED)
+        held = held and number_in(self.guarantee, "set_entered") is None
         return number_in(self.guarantee, "rate") or None if held else None
 
     def error_bound(self) -> Float[np.ndarray, " T"] | None:
@@ -228,6 +229,8 @@ class Recording(FrameNumbers):
         proved = stated.get("claim") is not None and stated["theorem"] == str(Theorem.T1)
         if not (proved and stated["covers_start"]) or self.metric is None:
             return None
+        if number_in(stated, "set_entered") is not None:
+            return None  # until then nothing bounds them
         rate = number_in(stated, "rate")
         if rate is None or self.saturated.any() or stated["ignores"]:
             return None

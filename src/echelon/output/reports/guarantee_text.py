@@ -179,6 +179,7 @@ def _rates(data: JsonObject) -> Iterator[Row]:
     everywhere = data["theorem"] in (str(Theorem.T5), str(Theorem.T9))
     if rate:
         how = "eventually" if not data["theorem"] else "or faster"
+        how += ", from there on" * ("set_entered" in numbers)
         yield "rate", f"{shown(data, 'rate')} {'eventually, on this graph' if everywhere else how}"
         if "message_age" in numbers:
             age = f"no message in use is older than {shown(data, 'message_age')}"
