@@ -48,7 +48,7 @@ class WorldPart:
         """Return what theorems of the ideal world leave out, a phrase; empty for nothing."""
         return f"`{type(self).__name__}` acts"
 
-    def unrested(self) -> str:
+    def ignored_at_rest(self) -> str:
         """Return what the steps at rest leave out, a phrase, such as what is random."""
         return ""
 
@@ -64,7 +64,7 @@ class WorldPart:
         """Return it in words, for data."""
         return str(self)
 
-    def told(self, result: Any) -> str:
+    def sentences(self, result: Any) -> str:
         """Return what a report says of it, in sentences."""
         return f"{(self.key or 'a part of your own').capitalize()}: {self.words(result.model)}."
 

@@ -156,7 +156,7 @@ class Network(WorldPart):
         """Return of what messages theorems are."""
         return "messages that arrive at once"
 
-    def told(self, result: Any) -> str:
+    def sentences(self, result: Any) -> str:
         """Return what a report says of it."""
         whole = self.messages is MessageContent.DEVIATION and self.prediction is Prediction.PREVIEW
         known = " Every agent knows the leader's whole plan before the start. "

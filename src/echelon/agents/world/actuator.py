@@ -66,7 +66,7 @@ class Actuator(WorldPart):
         """Return that inputs act late, or are others."""
         return "" if self == Actuator() else "the actuators lag or have levels"
 
-    def unrested(self) -> str:
+    def ignored_at_rest(self) -> str:
         """Return that levels round the inputs at rest."""
         return "the actuators have levels" if self.levels else ""
 
@@ -78,7 +78,7 @@ class Actuator(WorldPart):
         """Return the lag."""
         return Effects(lag=self.lag)
 
-    def told(self, result: Any) -> str:
+    def sentences(self, result: Any) -> str:
         """Return what a report says of it."""
         return f"Actuators: {self}; unknown to the laws."
 

@@ -107,13 +107,13 @@ class Disturbance(WorldPart):
         """Return that wind acts."""
         return "wind or noise acts on the agents"
 
-    unrested = ignored
+    ignored_at_rest = ignored
 
     def presumed(self) -> str:
         """Return nothing: agents in wind are the same agents."""
         return ""
 
-    def told(self, result: Any) -> str:
+    def sentences(self, result: Any) -> str:
         """Return what a report says of it."""
         return f"Disturbance: {self}; unknown to the laws."
 

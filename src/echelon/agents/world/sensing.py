@@ -193,7 +193,7 @@ class Sensing(WorldPart):
         """Return that states are not exact."""
         return "" if self == Sensing() else "agents measure their states late or with noise"
 
-    def unrested(self) -> str:
+    def ignored_at_rest(self) -> str:
         """Return that noise keeps agents from rest."""
         return "agents measure their states with noise" if any(self.noise.values()) else ""
 
@@ -206,7 +206,7 @@ class Sensing(WorldPart):
         """Return the delay, and whether it is estimated away."""
         return Effects(self.delay, estimated=self.estimator is not Estimation.NONE)
 
-    def told(self, result: Any) -> str:
+    def sentences(self, result: Any) -> str:
         """Return what a report says of it."""
         return f"Sensing of own states: {self}."
 

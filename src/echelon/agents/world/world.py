@@ -147,7 +147,7 @@ class Plants(WorldPart):
         plants += [f"agent {k}: {differences(model, x)}" for k, x in sorted(self.plants.items())]
         return "; ".join(plants)
 
-    def told(self, result: Any) -> str:
+    def sentences(self, result: Any) -> str:
         """Return what a report says of them."""
         return f"Plant: {self.words(result.model)}; laws and gains use the model's values."
 
@@ -198,9 +198,9 @@ class World:
         return tuple(filter(None, (part.ignored() for part in self.all_parts)))
 
     @property
-    def unrested(self) -> tuple[str, ...]:
+    def ignored_at_rest(self) -> tuple[str, ...]:
         """What the steps at rest leave out, a phrase each."""
-        return tuple(filter(None, (part.unrested() for part in self.all_parts)))
+        return tuple(filter(None, (part.ignored_at_rest() for part in self.all_parts)))
 
     @property
     def presumed(self) -> str:

@@ -85,7 +85,7 @@ class GuaranteeInputs(NamedTuple):
     def ignored(self) -> tuple[str, ...]:
         """What acts that no guarantee covers, a phrase each."""
         world = self.parts.world
-        acts = world.ignored if self.local is None else world.unrested
+        acts = world.ignored if self.local is None else world.ignored_at_rest
         acting = [x for x in acts if not (self.over_network and x == LATE)]
         # Far from 0 its numbers are centimetres apart, whatever a law does.
         acting += ["numbers have single precision"] * (self.settings.precision == "float32")

@@ -307,7 +307,7 @@ def _lag(result: Result) -> Iterator[str]:
 
 def _world(result: Result) -> Iterator[str]:
     for part in result.world.all_parts:
-        yield part.told(result)
+        yield part.sentences(result)
 
 
 def _reach(result: Result, guarantee: Guarantee) -> Iterator[str]:
