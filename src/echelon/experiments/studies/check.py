@@ -79,11 +79,12 @@ def _step_lines(steps: Split | None, dt: float) -> Iterator[Statement]:
     shown = f"{at_least(factors.low)} to {at_most(factors.high)}"
     yield holds(Topic.GAIN, _KIND, text, factors.low, shown)
     delay, low = delay_margin(steps), np.real(steps.eigenvalues).min()
-    if delay.eigenvalue is None:
+    if delay.last:
         text = f"z late by {amount(delay.steps, 'step')} of {dt:g} s, and no more were tried"
     else:
         text = f"z late by whole steps, up to {amount(delay.steps, 'step')} of {dt:g} s; one more"
-        text += f" is too late for lambda = {about(delay.eigenvalue)}"
+        late = delay.eigenvalue
+        text += " is undecided" if late is None else f" is too late for lambda = {about(late)}"
         text += "" if delay.each else "; beyond 20 steps every tenth part was tried"
     yield holds(Topic.DELAY, _KIND, text, delay.steps * dt, f"{about(1e3 * delay.steps * dt)} ms")
     best = delay_margin(steps._replace(eigenvalues=np.array([low]), between=False))

@@ -143,7 +143,8 @@ class DelayMargin(NamedTuple):
         steps: all delays up to it that were tried decay; -1 where not even current z are shown to.
         each: whether every whole number of steps up to it was tried.
         last: whether no more were tried.
-        eigenvalue: of what agents hear, whose mode grows most one step later; None with `last`.
+        eigenvalue: the largest of what agents hear whose mode grows one step later; None where
+            none is shown to grow.
     """
 
     steps: int
@@ -159,10 +160,10 @@ def delay_margin(split: Split) -> DelayMargin:
     each = steps < _EACH
     if steps == _MOST or steps < 0:
         return DelayMargin(steps, each, steps == _MOST, None)
-    values = split.eigenvalues
-    few = values[np.unique(np.linspace(0, len(values) - 1, _CHUNK).astype(int))]
-    radii = [max(locus.radius(k, steps + 1) for locus in loci) for k in few]
-    worst = complex(few[int(np.argmax(radii))])
+    growing = np.concatenate([locus.growing(steps + 1) for locus in loci])
+    if not len(growing):
+        return DelayMargin(steps, each, False, None)
+    worst = complex(growing[int(np.argmax(np.abs(growing)))])
     return DelayMargin(steps, each, False, worst if worst.imag else worst.real)
 
 
@@ -217,6 +218,10 @@ class _Locus:
         strength = values[:, None] * late - self._middle
         return 1.0 - strength[..., None] * self._T
 
+    def growing(self, delay: int) -> Array:
+        """Return the eigenvalues whose modes are counted outside of the circle at such a delay."""
+        return self._values[self._turns(delay)[0] != 0.0] if self._stable else self._values[:0]
+
     def _turns(self, delay: int) -> tuple[Array, Array]:
         """Return the turns (K,) of the determinants, and the largest angle of each step (T,)."""
         turns, most = np.zeros(len(self._values)), np.zeros(len(self._angles) - 1)
@@ -235,16 +240,3 @@ class _Locus:
         """Each factor is linear in lambda, so that it passes 0 between two only in half a turn."""
         each = self._factors(self._values, delay)
         return bool((np.abs(np.angle(each[1:] / each[:-1])) < 0.5 * np.pi).all())
-
-    def radius(self, value: complex, delay: int) -> float:
-        """Return the spectral radius of a step with z so many steps late, of one eigenvalue."""
-        n, r = len(self._F), len(self._V)
-        whole = np.zeros((n + r * delay, n + r * delay), np.result_type(self._F, value))
-        whole[:n, :n] = self._F
-        if not delay:
-            whole += value * self._U @ self._V
-        else:
-            whole[:n, n + r * (delay - 1) :] = value * self._U
-            whole[n : n + r, :n] = self._V
-            whole[n + r :, n:-r] = np.eye(r * (delay - 1))
-        return float(spectral_radii(whole))
