@@ -26,7 +26,8 @@ _TRUSTED: Final = {
 }
 _PLAIN: Final = (bool, int, float, complex, str, bytes, Fraction, type(None))
 _SPECIAL: Final = {
-    *("__dict__", "__weakref__", "__doc__", "__module__", "__annotations__", "__slots__")
+    *("__dict__", "__weakref__", "__doc__", "__module__", "__annotations__", "__slots__"),
+    "__signature__",  # follows from what is read, and takes long to hash
 }
 _LIBRARIES: Final = tuple(sysconfig.get_paths()[name] for name in ("stdlib", "purelib", "platlib"))
 
@@ -212,7 +213,8 @@ class _Walk:
 
 def _is_installed(home: str) -> bool:
     """Return whether a module is of Python or of an installed package, and so does not change."""
-    return _is_installed_package(home.partition(".")[0], id(sys.modules.get(home)))
+    package = home.partition(".")[0]
+    return package in _TRUSTED or _is_installed_package(package, id(sys.modules.get(home)))
 
 
 @functools.lru_cache(1024)
@@ -281,7 +283,7 @@ def _global(value: object, names: tuple[str, ...]) -> Iterator[object]:
     """Yield a global, or of somebody's own module what the code may read of it."""
     if not isinstance(value, ModuleType):
         yield value
-    elif not _is_installed(value.__name__) and not value.__name__.startswith("echelon"):
+    elif not _is_installed(value.__name__):
         for name in names:
             if name in vars(value):
                 yield name
