@@ -16,7 +16,7 @@ import numpy as np
 
 from echelon.simulation.codegen import Body, Code, Plan, aligned, program, shared
 from echelon.simulation.codegen.emitter import general_case
-from echelon.simulation.native.agent_step import body_of
+from echelon.simulation.native.agent_step import program_of
 from echelon.simulation.native.kernel_cache import LANES
 from echelon.simulation.native.stepper import NativeStepper
 from echelon.simulation.native.threads import call, step_by_step
@@ -81,7 +81,8 @@ class Follower:
     def __init__(self, stepper: NativeStepper, bits: int) -> None:
         """Put all that is read into rows, and all that is written."""
         self.bits, self.lanes, varying = bits, LANES[bits], stepper.varying
-        body = body_of(varying, bits, stepper.rows, False, bool(stepper.plan.table))
+        follows = bool(stepper.plan.table)
+        body = program_of(varying, bits, stepper.rows, False, follows).body
         places: dict[Any, int] = {}
 
         def read(node: Node, _: Any) -> Node | None:
@@ -142,7 +143,6 @@ class Follower:
             apart=False,
             exception_row=0,
             table=0,
-            dt=0.0,
         )
         code = Code(program(plan))
 

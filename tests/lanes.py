@@ -49,7 +49,6 @@ def text_of(function, count, bits=64, lanes=None):
         apart=False,
         exception_row=count + len(results),
         table=0,
-        dt=0.0,
     )
     return program(plan), len(results), plan
 

@@ -139,8 +139,7 @@ def test_a_time_is_said_in_words():
 def test_native_code_that_there_is_not_is_refused_before_a_run_begins(here, echelon, monkeypatch):
     begun = []
     monkeypatch.setattr(STATUS, "begin", lambda text, log=True: begun.append(text))
-    native = ["--set", "network={rate: 20, prediction: packet}"]
-    native += ["--set", "simulation.engine=native"]
-    code, _, err = echelon("run", "integrators", *native, "--out", "o")
-    assert code == 2 and "no native code for a network that is not ideal" in err
-    assert begun == ["preparing integrators"] and not (here / "o").exists()
+    native = ["--set", "simulation.engine=native"]
+    code, _, err = echelon("run", "crossing", *native, "--out", "o")
+    assert code == 2 and "no native code for agents that keep away" in err
+    assert begun == ["preparing crossing"] and not (here / "o").exists()

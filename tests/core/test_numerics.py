@@ -5,12 +5,15 @@ import subprocess
 import sys
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from processes import without_status
 
 import echelon as ech
-from echelon.core.numerics import precision
+from echelon.core.numerics import Draw, key_of, normals, precision, uniform
 
 GAIN = """
 import echelon as ech
@@ -113,3 +116,16 @@ def test_settings_of_jax_change_no_bit_of_a_run_that_diverges():
 def test_integers_of_two_types_add_where_jax_would_refuse_them():
     with jax.numpy_dtype_promotion("strict"), precision("float64"):
         assert jax.numpy.ones((), int) + jax.numpy.ones((), np.int32) == 2
+
+
+@given(st.integers(0, 2**63 - 1), st.integers(-(2**31), 2**31 - 1), st.integers(0, 2**31 - 1))
+@settings(max_examples=20)
+def test_draws_have_the_bits_of_those_of_jax(seed, step, agent):
+    key, step, agent = key_of(seed), np.int32(step), np.int32(agent)
+    folded = jax.random.wrap_key_data(jnp.asarray(key), impl="threefry2x32")
+    for number in (Draw.GUST, step, agent):
+        folded = jax.random.fold_in(folded, number)
+    ours = normals(key, Draw.GUST, step, agent, size=5), uniform(key, Draw.GUST, step, agent)
+    theirs = jax.random.normal(folded, (5,), jnp.float32), jax.random.uniform(folded)
+    for a, b in zip(ours, theirs, strict=True):
+        np.testing.assert_array_equal(a, np.asarray(b, np.float32))

@@ -148,13 +148,12 @@ def test_states_beyond_the_range_of_the_sines_go_on_by_jax():
 
 
 @pytest.mark.parametrize("command", ["sweep", "compare", "run"])
-def test_native_code_over_a_network_is_refused_before_anything_is_made(echelon, here, command):
+def test_native_code_of_safety_is_refused_before_anything_is_made(echelon, here, command):
     over = ("--over", "seed=0..2") if command == "sweep" else ()
-    network = "network={rate: 50, prediction: packet}"
-    changes = ("--set", network, "--set", "simulation.engine=native")
-    code, out, err = echelon(command, "integrators", *over, *changes, "--out", "o")
+    changes = ("--set", "simulation.engine=native")
+    code, out, err = echelon(command, "crossing", *over, *changes, "--out", "o")
     assert (code, out) == (2, "") and not (here / "o").exists()
-    assert "no native code for a network that is not ideal" in err and "simulating" not in err
+    assert "no native code for agents that keep away" in err and "simulating" not in err
 
 
 class Bends(ech.laws.Law):

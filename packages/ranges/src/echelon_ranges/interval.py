@@ -33,7 +33,8 @@ class Interval:
 
     def scale(self, factor: Fraction) -> "Interval":
         """Return factor times the interval."""
-        return self * Interval(factor, factor)
+        ends = self.lo * factor, self.hi * factor
+        return Interval(*ends) if factor >= 0 else Interval(*ends[::-1])
 
     def power(self, k: int) -> "Interval":
         """Return the range of x^k for an integer k >= 1."""

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Int
 
 from echelon.agents.part import WorldPart
 from echelon.core.errors import SimulationError, check_kind, is_number
-from echelon.core.numerics import Draw, key_of, uniforms
+from echelon.core.numerics import Draw, key_of, uniform
 from echelon.core.types import Array, PyTree
 from echelon.core.words import MessageContent, NeighbourChoice, Prediction
 
@@ -340,18 +340,23 @@ class Channel(eqx.Module):
         senders: Array | jax.Array,
     ) -> tuple[Bool[jax.Array, " K"], Int[jax.Array, " K"], Bool[jax.Array, " K"]]:
         """Return which links lose a message, how late it is beyond the delay, and which are out."""
-        kinds = (Draw.JITTER, Draw.LOSS, Draw.OUTAGE)[: 2 + self.bursty]
 
         def one(
             out: jax.Array, i: jax.Array, j: jax.Array
         ) -> tuple[jax.Array, jax.Array, jax.Array]:
             # By receiver and sender, and not by the link's place: no other edge changes a draw.
-            draws = uniforms(self.key, kinds, number, i, j)
-            late, lost = jnp.floor(draws[0] * (self.jitter + 1)), draws[1] < self.loss
+            # Without jitter nothing is drawn, which takes as long as all else.
+            drawn = jax.lax.cond(
+                self.jitter > 0,
+                lambda: uniform(self.key, Draw.JITTER, number, i, j),
+                lambda: jnp.zeros(()),
+            )
+            late = jnp.floor(drawn * (self.jitter + 1))
+            lost = uniform(self.key, Draw.LOSS, number, i, j) < self.loss
             if self.bursty:
                 stays = jnp.where(out, 1.0 - self.ends, self.begins)
                 chance = jnp.where(step == 0, self.share, stays)
-                out = draws[2] < chance
+                out = uniform(self.key, Draw.OUTAGE, number, i, j) < chance
             return lost | out, late.astype(jnp.int32), out
 
         return jax.vmap(one)(out, jnp.asarray(receivers), jnp.asarray(senders))

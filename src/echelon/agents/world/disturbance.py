@@ -202,16 +202,6 @@ class Wind(eqx.Module):
     air: Array | None = None
 
     @property
-    def remembers(self) -> bool:
-        """Whether a draw depends on the last one."""
-        return self.fade is not None
-
-    @property
-    def moves(self) -> bool:
-        """Whether it is air that moves, which acts by the state."""
-        return self.air is not None
-
-    @property
     def memoryless(self) -> "Wind":
         """The wind without what is correlated."""
         return self if self.fade is None else dataclasses.replace(self, rms=None, fade=None)

@@ -17,7 +17,7 @@ from echelon.core.cache import memoize
 from echelon.core.digits import about
 from echelon.core.errors import GainError
 from echelon.core.numerics import derivatives, precision
-from echelon.core.rational import float_below, root_bounds
+from echelon.core.rational import float_above, float_below, root_bounds
 from echelon.laws.stopping_point import StoppingLeader
 from echelon_ranges import Interval, RangeError, enclose_derivatives, enclose_finely, point
 
@@ -98,6 +98,29 @@ def _pieces(reference: LeaderPath, horizon: float, outputs: tuple[str, ...], ord
         times += [piece.end for piece in rows]
         values += [tuple(map(tuple, piece.rows)) for piece in rows]
     return Pieces(tuple(times), tuple(values))
+
+
+@memoize
+def path_speed(
+    leader: StoppingLeader,
+    model: ControlAffine,
+    horizon: float,
+    output: int,
+    until: float | None = None,
+) -> float:
+    """Return what |zeta_r'| of an output's path does not pass until a time (s), or the horizon.
+
+    Raises:
+        GainError: the path has no enclosure.
+    """
+    chains = leader.ready.chains
+    pieces = pieces_of(leader, model, horizon, chains.outputs, max(chains.degrees))
+    factors = list(map(Fraction, leader.ready.weights[:, output].tolist()))
+    sums = (
+        sum((rows[order + 1][output].scale(k) for order, k in enumerate(factors)), point(0))
+        for rows in pieces.between(Fraction(0), None if until is None else Fraction(until))
+    )
+    return float_above(max(max(-each.lo, each.hi) for each in sums))
 
 
 def least_on_path(

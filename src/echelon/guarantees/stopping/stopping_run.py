@@ -22,7 +22,6 @@ from echelon.core.compiled import cached_jit
 from echelon.core.digits import about, at_least, at_most
 from echelon.core.errors import GraphError
 from echelon.core.linear import sampled_radius
-from echelon.core.rational import float_above
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array
 from echelon.core.words import Feedforward, Kind
@@ -34,14 +33,13 @@ from echelon.guarantees.messages.late_messages import (
 )
 from echelon.guarantees.stopping.chain_response import Chain
 from echelon.guarantees.stopping.moving_offsets import size_beside
-from echelon.guarantees.stopping.path_bounds import pieces_of
+from echelon.guarantees.stopping.path_bounds import path_speed
 from echelon.laws.flat_loop import FlatLoop
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint, beginning_of
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.scalars import Node, ScalarGraph, Unsupported, lower, nodes
 from echelon.simulation.step.settings import Settings
-from echelon_ranges import point
 
 # ---- states that are flat outputs ----------------------------------------------------------------
 
@@ -322,17 +320,7 @@ class StoppingRun(NamedTuple):
         Raises:
             GainError: the path has no enclosure.
         """
-        chains, weights = self.law.ready.chains, self.leader.ready.weights[:, output]
-        highest = max(chains.degrees)
-        pieces = pieces_of(
-            self.leader, self.parts.model, self.settings.horizon, chains.outputs, highest
-        )
-        factors = [Fraction(k) for k in weights.tolist()]
-        sums = (
-            sum((rows[order + 1][output].scale(k) for order, k in enumerate(factors)), point(0))
-            for rows in pieces.between(Fraction(0), None if until is None else Fraction(until))
-        )
-        return float_above(max(max(-each.lo, each.hi) for each in sums))
+        return path_speed(self.leader, self.parts.model, self.settings.horizon, output, until)
 
     @property
     def links(self) -> int:

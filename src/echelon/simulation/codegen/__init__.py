@@ -2,7 +2,7 @@
 
 from echelon.simulation.codegen.block_copy import copy_rows
 from echelon.simulation.codegen.factoring import factored
-from echelon.simulation.codegen.kernel_plan import SHIFTED, SLOTS, TASK, Body, Plan, stride
+from echelon.simulation.codegen.kernel_plan import SHIFTED, SLOTS, TASK, Body, Letters, Plan, stride
 from echelon.simulation.codegen.kernel_text import program
 from echelon.simulation.codegen.machine_code import (
     Code,
@@ -19,6 +19,7 @@ __all__ = [
     "TASK",
     "Body",
     "Code",
+    "Letters",
     "Plan",
     "aligned",
     "copy_rows",

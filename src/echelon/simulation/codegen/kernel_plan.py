@@ -17,8 +17,9 @@ _NONE: Mapping[int, Node] = MappingProxyType({})
 class Body(NamedTuple):
     """What some of the agents compute in a step; the same code for all of them.
 
-    A leaf is ("row", r), ("z", k), ("message", k), ("leader", k), ("self", k), ("neighbour", k) or,
-    the same for all agents, ("time",), ("step",), ("steady",), ("table", c), ("uniform", k).
+    A leaf is ("row", r), ("z", k), ("message", k), ("leader", k), ("ahead", k), ("self", k),
+    ("neighbour", k), what a neighbour shows, or the last number k that came by its link; or, the
+    same for all agents, ("step",), ("steady",), ("table", c), ("uniform", k).
 
     Attributes:
         stores: row -> its new value.
@@ -28,6 +29,7 @@ class Body(NamedTuple):
             time.
         mirror: what neighbours read after the step, entry by entry.
         tape: row of the tape -> what is recorded there at each step, if a tape is given.
+        letter: what the agent sends in the steps in which it sends, number by number.
         exceptions: truths; where one holds, the agent's numbers are not what JAX computes.
         mirror_before: what neighbours read at the step, entry by entry.
         difference: of the leaves `self` and `neighbour`, entry by entry; z_k is the weighted sum of
@@ -40,6 +42,7 @@ class Body(NamedTuple):
     on_request: Mapping[int, Node] = _NONE
     mirror: Sequence[Node] = ()
     tape: Mapping[int, Node] = _NONE
+    letter: Sequence[Node] = ()
     exceptions: Sequence[Node] = ()
     # Not written; what is written reads them.
     mirror_before: Sequence[Node] = ()
@@ -74,6 +77,27 @@ def _nodes_in(parts: Sequence[_Part]) -> list[Node]:
     return [node for nodes in lists for node in nodes]
 
 
+class Letters(NamedTuple):
+    """What agents send where that takes time: letters, of which the last ones are stored.
+
+    Attributes:
+        size: numbers of a letter.
+        value: of them the first, which a receiver keeps for each link, with the last one.
+        packet: rows of an agent with the others, which are passed on: of the newest it received.
+        slots: letters of each agent that are stored.
+    """
+
+    size: int
+    value: int
+    packet: range
+    slots: int
+
+    @property
+    def kept(self) -> list[int]:
+        """The numbers of a letter that are kept for each link."""
+        return [*range(self.value), self.size - 1]
+
+
 class Plan(NamedTuple):
     """A kernel before it is code.
 
@@ -89,6 +113,8 @@ class Plan(NamedTuple):
             `neighbours.has_flag`, if there is one.
         first: the body of the agents that act first.
         others: the body of all others, level by level.
+        prior_first, prior_others: what both do in each step before any agent acts; None of nothing.
+            Then neighbours read what these show, and not what the step before has shown.
         message_start: the first row of what an agent sends besides its state.
         message_size: how many rows that is.
         one_source: whether one agent sends to all others, so that no sender is looked up.
@@ -99,13 +125,17 @@ class Plan(NamedTuple):
         edge_shifts: how many positions the two ends of the edges of most blocks are away.
         edges: entries that neighbours read of which distances are computed; none if no distances
             are.
+        goals: entries that are the goals of these, where they change with time; else none.
         apart: whether the goals of some neighbours differ; else distances are their own errors.
         exception_row: becomes 1 where one of `Body.exceptions` holds.
         table: numbers per step in the table.
-        dt: s.
+        given: numbers of each agent and step that are given.
+        letters: what is sent over links on which it takes time; None where all is heard at once.
         leaders_ahead: whether the leaders may take many steps before the others take the first,
             because they receive nothing: what they send is stored for each step.
         tape_rows: rows per block and step on the tape.
+        paired: rows of a block by which two agents of a formation are apart, of which the smallest
+            distance is kept; none where a tape has them.
     """
 
     bits: int
@@ -125,11 +155,28 @@ class Plan(NamedTuple):
     apart: bool
     exception_row: int
     table: int
-    dt: float
+    given: int = 0
     shifts: tuple[int, ...] = ()
     edge_shifts: tuple[int, ...] = ()
     leaders_ahead: bool = False
     tape_rows: int = 0
+    paired: tuple[int, ...] = ()
+    goals: tuple[int, ...] = ()
+    letters: Letters | None = None
+    prior_first: Body | None = None
+    prior_others: Body | None = None
+
+    @property
+    def bodies(self) -> dict[str, Body]:
+        """The bodies by their names."""
+        names = "first", "others", "prior_first", "prior_others"
+        bodies = ((name, getattr(self, name)) for name in names)
+        return {name: body for name, body in bodies if body is not None}
+
+    @property
+    def listens_first(self) -> bool:
+        """Whether all agents do a part of a step before any of them acts."""
+        return self.prior_others is not None
 
     @property
     def mirror(self) -> int:
@@ -153,6 +200,9 @@ class Context(NamedTuple):
         leader_messages: what they sent at this step.
         leader_count: the positions of leaders.
         tape: this step's part of the tape.
+        given: the numbers that are given of this step.
+        arrivals: where in memory are the letters that arrive at this step; -1 where none does.
+        sends: the row of the letters that are sent at this step; -1 if none is.
         at_hand: place of a number that is the same for all agents -> the number, loaded before.
     """
 
@@ -167,6 +217,9 @@ class Context(NamedTuple):
     leader_messages: str = ""
     leader_count: str = ""
     tape: str = ""
+    given: str = ""
+    arrivals: str = ""
+    sends: str = ""
     at_hand: Mapping[int, str] = MappingProxyType({})
 
 
@@ -191,6 +244,13 @@ SLOTS = (
     "progress",
     "yield_processor",
     "tape",
+    "ahead",
+    "arrivals",
+    "sends",
+    "mail",
+    "ring",
+    "pairs",
+    "pair_ends",
     "first_step",
     "steps",
     "count",
@@ -204,8 +264,11 @@ SLOTS = (
     "threads",
     "thread",
     "tape_step",
+    "ahead_step",
+    "arrivals_step",
+    "pair_count",
 )
-"""The arguments of a kernel: 20 addresses and 13 whole numbers of 64 bits.
+"""The arguments of a kernel: 27 addresses and 16 whole numbers of 64 bits.
 
 Formations are stored in groups of as many as a vector has lanes; `rows`, the mirrors and `edges`
 are those of the first of some groups, which have `blocks` and `edge_blocks` each. A swarm is one
@@ -222,11 +285,22 @@ as `before` says, and each thread behind it as many as `after`. `progress` count
 each has finished, one cache line apart, and `yield_processor` is a function that yields the
 processor.
 
-`tape` is 0 if nothing is recorded, and `tape_step` is how many numbers lie between its steps.
+`tape` is 0 if nothing is recorded, and `tape_step` is how many numbers lie between its steps;
+`ahead_step` is that of the numbers that are computed `ahead` of each agent and step.
+
+`ring` has the last letters, row after row of all agents; `mail` has for each slot of a neighbour
+what is kept of the last one. `arrivals` has for each slot, and behind them for each agent of which
+a packet is newer, the place in `ring`, and `arrivals_step` lie between two steps; `sends` has for
+each step the row that is written.
+
+`pairs` has the least square of the distance of each two agents of a formation, `pair_count` of
+them, and the step of it; `pair_ends` has the blocks of the two.
 """
 TASK = ("passed", "level", "start", "end", "first_edge", "last_edge", "before", "after")
-"""Of a task: the steps before it in this call, the level, and where its blocks begin and end."""
-ADDRESSES = 20
+"""Of a task: the steps before it in this call, the level, and where its blocks begin and end.
+
+Level 0 are the leaders, and -1 is what all do before any of them acts."""
+ADDRESSES = 27
 
 
 def stride(width: int, lanes: int) -> int:

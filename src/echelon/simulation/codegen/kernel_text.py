@@ -22,10 +22,12 @@ from echelon.simulation.codegen.kernel_plan import (
     Context,
     Plan,
 )
+from echelon.simulation.codegen.letters import part_of_group, send, take
 from echelon.simulation.codegen.neighbours import (
     exchange,
     leader_row,
     measure_edges,
+    measure_pairs,
     mirror_row,
     write_mirror,
 )
@@ -44,7 +46,7 @@ from echelon.simulation.scalars import Node, needed
 def program(plan: Plan) -> str:
     """Return a kernel as text for LLVM."""
     w, numbers, plan = Writer(plan.bits, plan.lanes), shared(plan), separate_uniform(plan)
-    plan = plan._replace(first=fuse(plan.first), others=fuse(plan.others))
+    plan = plan._replace(**{name: fuse(body) for name, body in plan.bodies.items()})
     w.label("entry")
     slots = dict[str, str]()
     for place, name in enumerate(SLOTS):
@@ -94,8 +96,13 @@ def _group(w: Writer, plan: Plan, slots: dict[str, str], group: str) -> dict[str
         "next_mirror": (blocks, plan.mirror),
         "edges": (edges, (len(plan.edges) + 2) * plan.lanes),
         "tape": (blocks, plan.tape_rows * plan.lanes),
+        "ahead": (blocks, plan.given * plan.lanes),
+        "pairs": (w.put(f"mul i64 {group}, {slots['pair_count']}"), 2 * plan.lanes),
     }
-    return slots | {name: w.part(slots[name], *part) for name, part in parts.items()}
+    own = {name: w.part(slots[name], *part) for name, part in parts.items()}
+    if plan.letters:
+        own |= part_of_group(w, plan.letters, slots, group)
+    return slots | own
 
 
 def _tasks(w: Writer, plan: Plan, slots: dict[str, str], numbers: int) -> None:
@@ -104,12 +111,13 @@ def _tasks(w: Writer, plan: Plan, slots: dict[str, str], numbers: int) -> None:
         task = {name: w.load("i64", slots["schedule"], first, k) for k, name in enumerate(TASK)}
         wait(w, slots, task["before"], task["after"])
         context = _context(w, plan, slots, task["passed"], numbers)
-        leads, done = w.put(f"icmp eq i64 {task['level']}, 0"), w.fresh("done")
-        lead, follow = w.fresh("lead"), w.fresh("follow")
+        if plan.listens_first:
+            _prior(w, context, task)
+        leads = w.put(f"icmp eq i64 {task['level']}, 0")
+        lead, follow, done = (w.fresh(stem) for stem in ("lead", "follow", "done"))
         w.do(f"br i1 {leads}, label %{lead}, label %{follow}")
         w.label(lead)
-        _lead(w, context, task)
-        w.do(f"br label %{done}")
+        _lead(w, context, task, done)
         w.label(follow)
         if plan.edges:
             measure_edges(w, context, task["first_edge"], task["last_edge"])
@@ -119,6 +127,33 @@ def _tasks(w: Writer, plan: Plan, slots: dict[str, str], numbers: int) -> None:
         w.do(f"br label %{done}")
         w.label(done)
         announce(w, slots, number)
+
+
+def _prior(w: Writer, context: Context, task: dict[str, str]) -> None:
+    """Write what all do before any of them acts, if that is the task; then no other is."""
+    before = w.put(f"icmp slt i64 {task['level']}, 0")
+    bound = context.slots["leader_blocks"]
+    context = context._replace(next_mirror=context.mirror)
+    with only_if(w, w.put(f"zext i1 {before} to i64")):
+        least = _least(w, task["end"], bound)
+        bodies = context.plan.prior_first, context.plan.prior_others
+        for body, start, end in zip(
+            bodies, (task["start"], bound), (least, task["end"]), strict=True
+        ):
+            assert body is not None
+            here = _with_uniform(w, context, body)
+            with loop(w, start, end) as (block, _, _):
+                if context.plan.letters:
+                    base = w.part(here.slots["rows"], block, here.plan.rows * here.plan.lanes)
+                    take(w, here, block, base)
+                _act(w, here, body, block)
+    # The other levels have no blocks then.
+    for name in ("start", "end", "first_edge", "last_edge"):
+        task[name] = w.put(f"select i1 {before}, i64 0, i64 {task[name]}")
+
+
+def _least(w: Writer, a: str, b: str) -> str:
+    return w.put(f"select i1 {w.put(f'icmp slt i64 {a}, {b}')}, i64 {a}, i64 {b}")
 
 
 def _context(w: Writer, plan: Plan, slots: dict[str, str], passed: str, numbers: int) -> Context:
@@ -132,10 +167,21 @@ def _context(w: Writer, plan: Plan, slots: dict[str, str], passed: str, numbers:
     stored = w.put(f"zext i1 {stored} to i64")
     values = w.part(slots["uniform_values"], passed, numbers)
     tape = w.part(slots["tape"], passed, slots["tape_step"]) if plan.tape_rows else ""
+    given = w.part(slots["ahead"], passed, slots["ahead_step"]) if plan.given else ""
     slots = slots | {"input_step": stored}
-    context = Context(plan, slots, mirror, next_mirror, step, "", values, tape=tape)
-    if not plan.leaders_ahead:
-        return context
+    if plan.listens_first:
+        mirror = next_mirror = slots["mirror"]
+    context = Context(plan, slots, mirror, next_mirror, step, "", values, tape=tape, given=given)
+    if plan.letters:
+        arrivals = w.part(slots["arrivals"], passed, slots["arrivals_step"], "i32")
+        sends = w.load("i64", w.at("i64", slots["sends"], passed))
+        return context._replace(arrivals=arrivals, sends=sends)
+    return _ahead(w, context, passed) if plan.leaders_ahead else context
+
+
+def _ahead(w: Writer, context: Context, passed: str) -> Context:
+    """Write where a step is of what leaders ahead show and send."""
+    plan, slots = context.plan, context.slots
     blocks, each = slots["leader_blocks"], plan.message_size * plan.lanes
     sizes = [w.put(f"mul i64 {blocks}, {n}") for n in (plan.mirror, each)]
     names = "leader_mirrors", "leader_messages"
@@ -155,9 +201,11 @@ def _with_uniform(w: Writer, context: Context, body: Body) -> Context:
     return context._replace(at_hand=values)
 
 
-def _lead(w: Writer, context: Context, task: dict[str, str]) -> None:
-    """Write what the leaders do in a step; those ahead store it for the others."""
+def _lead(w: Writer, context: Context, task: dict[str, str], done: str) -> None:
+    """Write what the leaders do in a step, up to a label; those ahead store it for the others."""
     plan, slots = context.plan, context.slots
+    if plan.paired:
+        measure_pairs(w, context)
     if plan.leaders_ahead:
         after = w.part(context.leader_mirror, slots["leader_blocks"], plan.mirror)
         slots = slots | {"row_stride": context.leader_count}
@@ -169,6 +217,7 @@ def _lead(w: Writer, context: Context, task: dict[str, str]) -> None:
             messages = w.part(context.leader_messages, block, plan.message_size * plan.lanes)
             for k in range(plan.message_size):
                 w.store_row(w.load_row(base, plan.message_start + k), messages, k)
+    w.do(f"br label %{done}")
 
 
 def _act(w: Writer, context: Context, body: Body, block: str) -> None:
@@ -227,6 +276,8 @@ def _load(
     plan = context.plan
     if kind == "row":
         return w.load_row(base, rest[0])
+    if kind == "ahead":
+        return w.load_row(w.part(context.given, block, plan.given * plan.lanes), rest[0])
     if kind == "message":
         start, row = context.slots["rows"], plan.message_start + rest[0]
         if plan.leaders_ahead:
@@ -252,12 +303,19 @@ def _write(
             with _if_effective(w, emitter, op, node) as value:
                 w.store_row(w.operation(op, [w.load_row(base, row), value]), base, row)
     _note_exceptions(w, context.plan.exception_row, body, emitter, base)
-    write_mirror(w, context, [emitter.value(node) for node in body.mirror], block)
+    if body.mirror:
+        write_mirror(w, context, [emitter.value(node) for node in body.mirror], block)
+    if body.letter:
+        send(w, context, block, [emitter.value(node) for node in body.letter])
     if body.tape:
-        with only_if(w, w.put(f"ptrtoint ptr {context.slots['tape']} to i64")):
-            start = w.part(context.tape, block, context.plan.tape_rows * w.lanes)
-            for row, node in body.tape.items():
-                w.store_row(emitter.value(node), start, row)
+        _record(w, context, body, emitter, block)
+
+
+def _record(w: Writer, context: Context, body: Body, emitter: Emitter, block: str) -> None:
+    with only_if(w, w.put(f"ptrtoint ptr {context.slots['tape']} to i64")):
+        start = w.part(context.tape, block, context.plan.tape_rows * w.lanes)
+        for row, node in body.tape.items():
+            w.store_row(emitter.value(node), start, row)
 
 
 def _note_exceptions(w: Writer, row: int, body: Body, emitter: Emitter, base: str) -> None:
@@ -296,11 +354,8 @@ def _load_uniform(w: Writer, context: Context, kind: str, *rest: int) -> str:
     if kind in ("table", "uniform"):
         start = context.table if kind == "table" else context.uniform_values
         return w.load(w.scalar, start, rest[0])
-    step = w.put(f"sitofp i64 {context.step} to {w.scalar}")
-    if kind == "step":
-        return step
-    # From the step number, because a sum of many dt would accumulate rounding errors.
-    return w.operation("mul", [step, w.number(context.plan.dt, uniform=True)], uniform=True)
+    assert kind == "step"
+    return w.put(f"sitofp i64 {context.step} to {w.scalar}")
 
 
 def _look_up(

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 
 from echelon.simulation.codegen.emitter import Emitter
 from echelon.simulation.codegen.kernel_plan import SHIFTED, Body, Context, Plan, stride
+from echelon.simulation.codegen.letters import link_mail
 from echelon.simulation.codegen.vector_ir import (
     Writer,
     either,
@@ -18,6 +19,7 @@ from echelon.simulation.codegen.vector_ir import (
     listed_block,
     load_places,
     loop,
+    only_if,
 )
 from echelon.simulation.scalars import Node, needed, rewritten
 
@@ -55,13 +57,13 @@ def exchange(
     def add_up_listed() -> list[str]:
         return either(w, flag(w, slots["contiguous"], block), add_up)
 
-    if plan.row_major and plan.shifts:
+    if plan.row_major and plan.shifts and not plan.letters:
         kind = w.load("i8", slots["contiguous"], block)
         usual = w.put(f"icmp eq i8 {kind}, {SHIFTED}")
         totals = either(w, usual, lambda so: add_up(so, plan.shifts) if so else add_up_listed())
-    elif plan.row_major:
+    elif plan.row_major and not plan.letters:
         totals = add_up_listed()
-    elif plan.batched or not plain:
+    elif plan.batched or plan.letters or not plain:
         totals = add_up(False)
     elif not (has_flag(plan) or plan.leaders_ahead):
         totals = _subtract(w, context, ends, first, entries)
@@ -93,7 +95,11 @@ def _sums(
     entries = _read_entries(differences)
     zero = [(w.vector, "zeroinitializer")] * len(differences)
     with loop(w, *ends, zero) as (slot, totals, following):
-        theirs = _listed_entries(w, context, "neighbours", slot, entries, contiguous)
+        if context.plan.letters:
+            mail = link_mail(w, context, slot)
+            theirs = {k: w.load_row(mail, k) for k in entries}
+        else:
+            theirs = _listed_entries(w, context, "neighbours", slot, entries, contiguous)
         following[:] = _added(w, context, slot, differences, mine | theirs, totals)
     return totals
 
@@ -119,7 +125,7 @@ def _shifted_sums(
 
 def _read_entries(differences: Sequence[Node]) -> list[int]:
     leaves = [n for n in needed(differences) if n.op == "leaf"]
-    return sorted({n.value[1] for n in leaves if n.value[0] == "neighbour"})
+    return sorted({n.value[1] for n in leaves if n.value[0] in ("neighbour", "link")})
 
 
 def _added(
@@ -130,7 +136,8 @@ def _added(
     values: dict[Node | int, str],
     totals: Sequence[str],
 ) -> list[str]:
-    emitter = Emitter(w, lambda leaf: values[leaf if leaf.value[0] == "self" else leaf.value[1]])
+
+    emitter = Emitter(w, _reader(w, context, values))
     emitter.emit(differences)
     read = [emitter.value(node) for node in differences]
     if context.plan.weighted:
@@ -138,6 +145,18 @@ def _added(
         weight = w.load(w.vector, context.slots["weights"], place)
         read = [w.operation("mul", [value, weight]) for value in read]
     return [w.operation("add", list(pair)) for pair in zip(totals, read, strict=True)]
+
+
+def _reader(w: Writer, context: Context, values: dict[Node | int, str]) -> Callable[[Node], str]:
+    """Return what loads the leaves of a difference."""
+
+    def load(leaf: Node) -> str:
+        kind, k = leaf.value
+        if kind == "uniform":
+            return w.load(w.scalar, context.uniform_values, k)
+        return values[leaf if kind == "self" else k]
+
+    return load
 
 
 def _row_part(w: Writer, context: Context, row: int, place: str) -> str:
@@ -149,10 +168,11 @@ def _row_part(w: Writer, context: Context, row: int, place: str) -> str:
 def _own_entries(
     w: Writer, context: Context, shown: dict[Node, Node], block: str, load: Callable[[Node], str]
 ) -> dict[Node, str]:
-    if context.plan.batched:
+    letters = context.plan.letters is not None
+    if context.plan.batched and not letters:
         start = w.part(context.mirror, block, context.plan.mirror)
         return {leaf: w.load_row(start, leaf.value[1]) for leaf in shown}
-    if context.plan.row_major:
+    if context.plan.row_major and not letters:
         first = w.put(f"mul i64 {block}, {w.lanes}")
         return {
             leaf: w.load(w.vector, mirror_row(w, context, leaf.value[1], first), 0)
@@ -342,42 +362,77 @@ def _shuffle(w: Writer, a: str, b: str, order: Sequence[int]) -> str:
 def measure_edges(w: Writer, context: Context, start: str, end: str) -> None:
     """Write the loop that adds up by how much distances along edges differ from their goals'."""
     plan, slots, axes = context.plan, context.slots, context.plan.edges
+    read = [*axes, *plan.goals]
     with loop(w, start, end) as (block, _, _):
         base = w.part(slots["edges"], block, (len(axes) + 2) * plan.lanes)
-        first = w.put(f"mul i64 {block}, 2")
-        second = w.put(f"add i64 {first}, 1")
-
-        def read(contiguous: bool, pair: tuple[str, str] = (first, second)) -> list[str]:
-            ends = [_listed_entries(w, context, "edge_ends", k, axes, contiguous) for k in pair]
-            return [end[axis] for axis in axes for end in ends]
-
-        def read_listed() -> list[str]:
-            return either(w, flag(w, slots["contiguous_edges"], block), read)
-
-        def read_shifted() -> list[str]:
-            here = w.put(f"mul i64 {block}, {w.lanes}")
-            places = [w.put(f"add i64 {here}, {shift}") for shift in plan.edge_shifts]
-            return [_row_part(w, context, axis, place) for axis in axes for place in places]
-
-        if plan.row_major and plan.edge_shifts:
-            kind = w.load("i8", slots["contiguous_edges"], block)
-            usual = w.put(f"icmp eq i8 {kind}, {SHIFTED}")
-            ends = either(w, usual, lambda so: read_shifted() if so else read_listed())
-        else:
-            ends = read_listed() if plan.row_major else read(False)
-        squares = "zeroinitializer"
+        ends = _ends(w, context, block, read)
+        squares = desired = "zeroinitializer"
         for k in range(len(axes)):
             difference = w.operation("sub", ends[2 * k : 2 * k + 2])
-            if plan.apart:
+            if plan.goals:
+                far = 2 * (k + len(axes))
+                goal = w.operation("sub", ends[far : far + 2])
+                difference = w.operation("add", [difference, goal])
+                desired = w.operation("add", [desired, w.operation("mul", [goal, goal])])
+            elif plan.apart:
                 difference = w.operation("add", [difference, w.load_row(base, k)])
             square = w.operation("mul", [difference, difference])
             squares = w.operation("add", [squares, square])
-        if plan.apart:
-            distance = w.operation("sqrt", [squares])
-            error = w.operation("sub", [distance, w.load_row(base, len(axes))])
+        if plan.goals or plan.apart:
+            goal = w.load_row(base, len(axes))
+            desired = w.operation("sqrt", [desired]) if plan.goals else goal
+            error = w.operation("sub", [w.operation("sqrt", [squares]), desired])
             squares = w.operation("mul", [error, error])
         total = w.load_row(base, len(axes) + 1)
         w.store_row(w.operation("add", [total, squares]), base, len(axes) + 1)
+
+
+def _ends(w: Writer, context: Context, block: str, entries: Sequence[int]) -> list[str]:
+    """Write the loads of what both ends of a block of edges show, entry by entry."""
+    plan, slots = context.plan, context.slots
+    first = w.put(f"mul i64 {block}, 2")
+    second = w.put(f"add i64 {first}, 1")
+
+    def read(contiguous: bool, pair: tuple[str, str] = (first, second)) -> list[str]:
+        ends = [_listed_entries(w, context, "edge_ends", k, entries, contiguous) for k in pair]
+        return [end[entry] for entry in entries for end in ends]
+
+    def read_listed() -> list[str]:
+        return either(w, flag(w, slots["contiguous_edges"], block), read)
+
+    def read_shifted() -> list[str]:
+        here = w.put(f"mul i64 {block}, {w.lanes}")
+        places = [w.put(f"add i64 {here}, {shift}") for shift in plan.edge_shifts]
+        return [_row_part(w, context, entry, place) for entry in entries for place in places]
+
+    if plan.row_major and plan.edge_shifts:
+        kind = w.load("i8", slots["contiguous_edges"], block)
+        usual = w.put(f"icmp eq i8 {kind}, {SHIFTED}")
+        return either(w, usual, lambda so: read_shifted() if so else read_listed())
+    return read_listed() if plan.row_major else read(False)
+
+
+def measure_pairs(w: Writer, context: Context) -> None:
+    """Write the loop that keeps the smallest distances of each two agents of a formation."""
+    slots = context.slots
+    now = w.splat(w.put(f"sitofp i64 {context.step} to {w.scalar}"))
+    with loop(w, "0", slots["pair_count"]) as (pair, _, _):
+        first = w.put(f"mul i64 {pair}, 2")
+        second = w.put(f"add i64 {first}, 1")
+        ends = [listed_block(w, slots["pair_ends"], k, slots["rows"]) for k in (first, second)]
+        square = "zeroinitializer"
+        for row in context.plan.paired:
+            apart = w.operation("sub", [w.load_row(end, row) for end in ends])
+            square = w.operation("add", [square, w.operation("mul", [apart, apart])])
+        base = w.part(slots["pairs"], pair, 2 * w.lanes)
+        least = w.load_row(base, 0)
+        # Not of NaN.
+        closer = w.put(f"fcmp olt {w.vector} {square}, {least}")
+        with only_if(w, w.put(f"zext i1 {w.any_lane(closer)} to i64")):
+            truths = w.kind(True, False)
+            for row, value in enumerate((square, now)):
+                sides = f"{w.vector} {value}, {w.vector} {w.load_row(base, row)}"
+                w.store_row(w.put(f"select {truths} {closer}, {sides}"), base, row)
 
 
 # ---- differences of angles -----------------------------------------------------------------------

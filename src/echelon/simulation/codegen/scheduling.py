@@ -13,7 +13,7 @@ def shared(plan: Plan) -> list[Node]:
     They depend on the time and on the table alone, such as what a leader follows. They are computed
     once, and all groups of formations read them from memory, step by step.
     """
-    return [node for body in (plan.first, plan.others) for node in _border(body)]
+    return [node for body in plan.bodies.values() for node in _border(body)]
 
 
 def separate_uniform(plan: Plan) -> Plan:
@@ -26,8 +26,8 @@ def separate_uniform(plan: Plan) -> Plan:
         leaf = node.graph.leaf("uniform", places[node], uniform=True)
         return node.graph.make("ne", leaf, 0.0) if node.truth else leaf
 
-    first, others = (b.map_nodes(rewritten(b.all(), read)) for b in (plan.first, plan.others))
-    return plan._replace(first=first, others=others)
+    changed = {k: b.map_nodes(rewritten(b.all(), read)) for k, b in plan.bodies.items()}
+    return plan._replace(**changed)
 
 
 def _border(body: Body) -> list[Node]:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from echelon.agents.network.channel import NEVER, InFlight
+from echelon.agents.network.channel import NEVER
 from echelon.agents.network.hearing import edges_of
 from echelon.core.compiled import cached_jit
 from echelon.core.numerics import precision
@@ -19,10 +19,10 @@ from echelon.core.types import Array
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import channel_of, prepare
 from echelon.simulation.step.assembly import assemble
-from echelon.simulation.step.leadership import NOBODY, leaders_of
-from echelon.simulation.step.networks import LateNetwork, MessageRules, carries
-from echelon.simulation.step.records import Messages, NetworkEstimate, Steps
-from echelon.simulation.step.roster import Everybody, Links, roster_of
+from echelon.simulation.step.deliveries import Empty, Radio, deliver, empty
+from echelon.simulation.step.leadership import leaders_of
+from echelon.simulation.step.networks import LateNetwork, MessageRules
+from echelon.simulation.step.roster import Links, roster_of
 from echelon.simulation.step.settings import Settings
 
 
@@ -87,9 +87,8 @@ def traffic(parts: Parts, settings: Settings, times: Array, steps: int) -> Traff
             if not isinstance(own, LateNetwork):
                 return None  # nothing is known of its messages
             network = own
-        numbers = np.asarray(steps), np.asarray(settings.dt)
-        radio = _Radio(network, links, roster, receives, *numbers)
-        followed = _follow(radio, ends.astype(np.int32))
+        radio = Radio(network, links, roster, np.asarray(settings.dt))
+        followed = _follow(radio, receives, np.asarray(steps), ends.astype(np.int32))
         stamps, losses, counted = jax.tree.map(np.asarray, followed)
     shape = len(times), len(graph.edges), 2
     ages, lost = np.full(shape, np.nan), np.zeros(shape, int)
@@ -105,17 +104,6 @@ def traffic(parts: Parts, settings: Settings, times: Array, steps: int) -> Traff
         largest=float(counted.largest) if counted.used else np.nan,
         mean=float(counted.total / counted.used) if counted.used else np.nan,
     )
-
-
-class _Radio(NamedTuple):
-    """The network of a run: who `receives` (K,) what, in a run of so many steps of dt (s)."""
-
-    network: LateNetwork
-    links: Links
-    roster: Everybody
-    receives: Bool[Array, " K"]
-    steps: Array
-    dt: Array
 
 
 class _Counts(NamedTuple):
@@ -138,8 +126,7 @@ class _Carry(NamedTuple):
     """What a network remembers; stamps at the last frame, losses since then, and the counts."""
 
     step: jax.Array
-    posts: InFlight
-    mail: Messages
+    messages: Empty
     stamps: Int[jax.Array, " K"]
     losses: Int[jax.Array, " K"]
     counts: _Counts
@@ -147,51 +134,46 @@ class _Carry(NamedTuple):
 
 @cached_jit
 def _follow(
-    radio: _Radio, ends: Int[Array, " T"]
+    radio: Radio, receives: Bool[Array, " K"], steps: Array, ends: Int[Array, " T"]
 ) -> tuple[Int[jax.Array, "T K"], Int[jax.Array, "T K"], _Counts]:
-    """Return the newest stamps at each frame, the losses after it, and the counts of all steps."""
+    """Return the newest stamps at each frame, the losses after it, and the counts of all steps.
+
+    Counts are of those who receive, in a run of so many steps.
+    """
 
     def frame(now: _Carry, end: jax.Array) -> tuple[_Carry, tuple[jax.Array, jax.Array]]:
         now, first = now._replace(losses=jnp.zeros_like(now.losses)), now.step
-        now = jax.lax.fori_loop(first, end, lambda _, now: _step(radio, first, now), now)
+
+        def one(_: jax.Array, now: _Carry) -> _Carry:
+            return _step(radio, receives, steps, first, now)
+
+        now = jax.lax.fori_loop(first, end, one, now)
         return now, (now.stamps, now.losses)
 
-    rules, links = radio.network.rules, len(radio.receives)
-    nothing = jnp.zeros((rules.agents, 0))
-    mail = rules.begin(jnp.arange(rules.agents, dtype=jnp.int32), links, nothing, 0)
-    sent = Messages(nothing, jnp.full(rules.agents, NOBODY, jnp.int32), mail.packet)
-    zero, none = jnp.zeros((), int), jnp.zeros(links, int)
+    zero, none = jnp.zeros((), int), jnp.zeros(len(receives), int)
     counts = _Counts(zero, zero, zero, zero, jnp.zeros(()), jnp.zeros(()))
-    posts = radio.network.medium.begin(sent, links)
-    start = _Carry(jnp.zeros((), jnp.int32), posts, mail, mail.stamp, none, counts)
+    messages = empty(radio.network, len(receives))
+    start = _Carry(jnp.zeros((), jnp.int32), messages, messages.mail.stamp, none, counts)
     now, (stamps, losses) = jax.lax.scan(frame, start, jnp.asarray(ends))
     return stamps, losses, now.counts
 
 
-def _step(radio: _Radio, first: jax.Array, now: _Carry) -> _Carry:
-    """Take a step of messages that say nothing; frames are stored at the step `first`."""
-    network, rules, channel = radio.network, radio.network.rules, radio.network.medium
-    clock, links = Steps(now.step, radio.dt), radio.links.at(now.step)
-    number = jnp.arange(rules.agents, dtype=jnp.int32)
-    here, since = radio.roster.here(now.step), radio.roster.since(now.step)
-    mail = network.delivered(now.posts, now.mail, number, clock, since, links, here)
-    leads = network.leadership.leads(mail.packet, number)
-    ages = clock.age(mail.stamp)
-    hops = rules.hops(mail, ages, leads, links, clock.dt)
-    used = rules.used(mail, ages, hops, links, clock.dt)
-    nothing = jnp.zeros((rules.agents, 0))
-    heard = NetworkEstimate(nothing, leads, nothing, nothing, hops)
-    rows = mail, heard, number, clock.now, nothing, nothing, jnp.subtract
-    messages, sends = rules.write(*rows)
-    posts = network.posted(now.posts, now.step, messages, sends, links)
-    sent = carries(links, sends) & (now.step % channel.every == 0)
-    lost = sent & (posts.arrival[(now.step // channel.every) % channel.slots] == NEVER)
+def _step(
+    radio: Radio, receives: Bool[Array, " K"], steps: Array, first: jax.Array, now: _Carry
+) -> _Carry:
+    """Take a step; frames are stored at the step `first`."""
+    channel, before = radio.network.medium, now.messages
+    messages, decided = deliver(radio, before, now.step)
+    sent = decided.sends & (now.step % channel.every == 0)
+    slot = (now.step // channel.every) % channel.slots
+    lost = sent & (messages.in_flight.arrival[slot] == NEVER)
     # All that arrives now but for the newest message, where it is newer than the last one.
-    late = (now.posts.arrival == now.step).sum(axis=0) - (mail.stamp > now.mail.stamp)
-    whole = ((x * radio.receives).sum() for x in (sent, lost, late, used))
-    old = jnp.where(used & radio.receives, ages, 0.0)
+    newer = messages.mail.stamp > before.mail.stamp
+    late = (before.in_flight.arrival == now.step).sum(axis=0) - newer
+    whole = ((x * receives).sum() for x in (sent, lost, late, decided.used))
+    old = jnp.where(decided.used & receives, decided.ages, 0.0)
     counts = _Counts(*whole, total=old.sum(), largest=old.max())
-    counts = jax.tree.map(lambda x: jnp.where(now.step < radio.steps, x, 0), counts)
-    stamps = jnp.where(now.step == first, mail.stamp, now.stamps)
-    losses = now.losses + lost * radio.receives
-    return _Carry(now.step + 1, posts, mail, stamps, losses, now.counts.plus(counts))
+    counts = jax.tree.map(lambda x: jnp.where(now.step < steps, x, 0), counts)
+    stamps = jnp.where(now.step == first, messages.mail.stamp, now.stamps)
+    losses = now.losses + lost * receives
+    return _Carry(now.step + 1, messages, stamps, losses, now.counts.plus(counts))

@@ -1,23 +1,27 @@
 """The step of one agent as scalar operations, and the rows of a block that hold its numbers.
 
-It is traced from the same laws, model, integrator and meter that `step.loop` runs.
+It is traced from `step.sequence`, which steps all agents, with one row of each member. What an
+agent remembers is one number after the other, whatever the members are. What depends on the step
+and on its number alone, such as what is drawn, the host computes ahead.
 """
 
+import dataclasses
 import functools
 import itertools
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, NamedTuple, TypeAlias, final
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from echelon.agents.network.exchange import Exchange
 from echelon.core.types import Array, PyTree
-from echelon.laws.law import Law, LocalView, Memory
-from echelon.laws.law_check import signal_size as numbers_said
+from echelon.laws.law_check import signal_size
 from echelon.simulation.codegen import Body, factored
 from echelon.simulation.native.varying import VaryingNumbers
 from echelon.simulation.scalars import (
+    HostPart,
     Node,
     ScalarGraph,
     Unsupported,
@@ -26,11 +30,58 @@ from echelon.simulation.scalars import (
     needed,
     nodes,
 )
-from echelon.simulation.step.loop import Loop
+from echelon.simulation.step.alone import one_row
+from echelon.simulation.step.leadership import NOBODY, FixedLeaders
+from echelon.simulation.step.loop import IdealNetwork, Loop
+from echelon.simulation.step.networks import LateNetwork, LeaderwardNeighbours
 from echelon.simulation.step.own_members import own_members
 from echelon.simulation.step.places import MovingPlaces
-from echelon.simulation.step.run_laws import limit_sides
+from echelon.simulation.step.records import (
+    ComponentMemory,
+    Control,
+    Known,
+    LawMemories,
+    LeaderPackets,
+    LeaderSpeech,
+    LoopState,
+    Messages,
+    NetworkEstimate,
+    Own,
+    Steps,
+)
+from echelon.simulation.step.roster import Links
+from echelon.simulation.step.sequence import act, begin, hear, saying
 from echelon.simulation.step.turns import by_depth
+
+# ---- what native code cannot step ----------------------------------------------------------------
+
+_OF_ONE = frozenset({"sensing", "motion"})
+"""Members that are traced as they are, a user's too: each acts on one agent alone."""
+
+
+def check_loop(loop: Loop) -> None:
+    """Raise `Unsupported` of a loop that native code cannot step."""
+    own = own_members(loop, _OF_ONE)
+    if own:
+        raise Unsupported(f"the member `{own}` of your own")
+    check_distances(loop)
+    late = letter_sizes(loop)
+    if late is not None and isinstance(late.network.rules.neighbours, LeaderwardNeighbours):
+        raise Unsupported("agents that use the messages of some neighbours alone")
+
+
+def check_distances(loop: Loop) -> None:
+    """Raise `Unsupported` if agents keep distances, come or go, or have backup leaders."""
+    changes = loop.roster.changes or loop.laws.backups
+    for fault, text in (
+        (loop.surroundings.keeps_apart, "agents that keep away from each other"),
+        (changes, "agents that are lost, join or take the lead"),
+    ):
+        if fault:
+            raise Unsupported(text)
+
+
+# ---- the rows of a block -------------------------------------------------------------------------
 
 
 class BlockRows(NamedTuple):
@@ -38,9 +89,12 @@ class BlockRows(NamedTuple):
 
     Attributes:
         state: x (n,).
-        offset: of its goal (n,).
-        push, noise: what wind adds to its rate (n,), and noise to its input (m,).
-        memory: of its law, one number after the other.
+        offset: of its goal (n,), at the start.
+        agent: all other numbers in which agents differ.
+        memory: of its law, its sensors and its plant, one number after the other.
+        sensed: what it knows of its state, what it says, and what it makes of its messages; none
+            where it knows and says x.
+        packet: of the newest message from a leader, what a leader says of itself, and when.
         cut: to which side limits moved each input in the previous step (m,).
         message: what it sends besides its state.
         input: that is applied (m,).
@@ -55,9 +109,10 @@ class BlockRows(NamedTuple):
 
     state: range
     offset: range
-    push: range
-    noise: range
+    agent: range
     memory: range
+    sensed: range
+    packet: range
     cut: range
     message: range
     input: range
@@ -78,55 +133,113 @@ class BlockRows(NamedTuple):
 
     @classmethod
     def of(cls, loop: Loop, varying: int = 0) -> "BlockRows":
-        """Return a loop's rows; `Unsupported` if memory is not numbers, or messages take time."""
-        check_information(loop)
-        if not loop.motion.ideal:
-            raise Unsupported(
-                "substeps, actuators that lag, correlated wind, air, or agents that differ"
-            )
+        """Return a loop's rows; `Unsupported` if it has no native code."""
+        check_loop(loop)
         n, m = len(loop.model.state_names), len(loop.model.input_names)
-        weather, q = loop.motion.weather, len(loop.model.output_names)
-        noisy = any(part.noise is not None for part in weather)
-        memory = max(memory_size(law) for law in (loop.laws.leader, loop.laws.follower))
-        sizes = [n, n, n if weather else 0, m if noisy else 0, memory, m]
-        sizes += [
-            loop.laws.message_size(loop.model, jax.eval_shape(loop.laws.leader.init)),
-            m,
-            varying,
-        ]
+        memories = [memory_size(memory_of(loop, leads)) for leads in (True, False)]
+        sizes = [n, n, sum(map(row_size, agent_rows(loop)[1:])), max(memories)]
+        late = letter_sizes(loop)
+        sizes += [sum(sensed_sizes(loop)) * listens_first(loop)]
+        sizes += [0 if late is None else late.packet + 1, m, forward_size(loop), m, varying]
         sizes += [2, 1, 1, 1, len(loop.meter.charted), 1]
-        sizes += [min(1, len(loop.meter.events)), *[loop.meter.extremes] * 2, 2, q, 1]
+        sizes += [min(1, len(loop.meter.events)), *[loop.meter.extremes] * 2]
+        sizes += [2, len(loop.model.output_names), 1]
         ends = np.cumsum([0, *sizes]).tolist()
         return cls._make([*(range(a, b) for a, b in itertools.pairwise(ends)), ends[-1]])
 
 
-def check_information(loop: Loop) -> None:
-    """Raise `Unsupported` unless agents know exact states, current messages, and nothing else."""
-    for fault, text in (
-        (isinstance(loop.places, MovingPlaces), "formations that change with time"),
-        (loop.network.late, "a network that is not ideal"),
-        (own_members(loop), f"the member `{own_members(loop)}` of your own"),
-        (loop.sensing.stages, "agents that measure their states late or with noise"),
-    ):
-        if fault:
-            raise Unsupported(text)
-    check_distances(loop)
+def agent_rows(loop: Loop) -> list[Array]:
+    """Return the numbers in which agents differ, each with a row of each agent; offsets first."""
+    return jax.tree.leaves((loop.places.rows, loop.motion.rows))
 
 
-def check_distances(loop: Loop) -> None:
-    """Raise `Unsupported` if agents keep distances, come or go, or have backup leaders."""
-    changes = loop.roster.changes or loop.laws.backups
-    for fault, text in (
-        (loop.surroundings.keeps_apart, "agents that keep away from each other"),
-        (changes, "agents that are lost, join or take the lead"),
-    ):
-        if fault:
-            raise Unsupported(text)
+def row_size(leaf: Array | jax.Array) -> int:
+    """Return how many numbers a row has."""
+    return int(np.prod(np.shape(leaf)[1:]))
 
 
-def memory_size(law: Law) -> int:
-    """Return how many numbers a law's memory has; `Unsupported` of others, as a random key."""
-    leaves = jax.tree.leaves(jax.eval_shape(law.init))
+def listens_first(loop: Loop) -> bool:
+    """Tell whether all agents sense and say before any of them acts.
+
+    Otherwise what an agent says in the next step is known at the end of this one.
+    """
+    moves = isinstance(loop.places, MovingPlaces)
+    return bool(loop.sensing.stages) or moves or loop.network.late
+
+
+def forward_size(loop: Loop) -> int:
+    """Return how many numbers a leader sends to its followers in the same step."""
+    return loop.laws.message_size(loop.model, jax.eval_shape(loop.laws.leader.init))
+
+
+class LetterSizes(NamedTuple):
+    """How many numbers a letter has: a value for neighbours, and a packet that is passed on."""
+
+    network: LateNetwork
+    value: int
+    packet: int
+
+    @property
+    def total(self) -> int:
+        """With the stamps of both."""
+        return self.value + self.packet + 2
+
+
+def letter_sizes(loop: Loop) -> LetterSizes | None:
+    """Return what letters contain; None where all is heard at once."""
+    network = loop.network
+    if not isinstance(network, LateNetwork):
+        return None
+    s, k, m = said_size(loop), forward_size(loop), len(loop.model.input_names)
+    return LetterSizes(network, s, network.rules.content.size(s, k, m))
+
+
+def sensed_sizes(loop: Loop) -> list[int]:
+    """Return the sizes of what an agent knows before it acts.
+
+    Its state, what it says, and over a late network where it expects its leader, the feed-forward,
+    and whether it knows of a leader.
+    """
+    n, s, late = len(loop.model.state_names), said_size(loop), loop.network.late
+    return [n, s, *[s, forward_size(loop), 1] * late]
+
+
+def said_size(loop: Loop) -> int:
+    """Return how many numbers an agent says."""
+    n = len(loop.model.state_names)
+    return (signal_size(loop.laws.follower, loop.model) or 0) if loop.laws.speech.signals else n
+
+
+def shown_size(loop: Loop) -> int:
+    """Return how many numbers neighbours read of an agent besides its state less its offset."""
+    said = loop.laws.speech.signals or listens_first(loop)
+    said = said and not loop.network.late
+    return len(shown_goals(loop)) + said_size(loop) * said
+
+
+def shown_goals(loop: Loop) -> tuple[int, ...]:
+    """Return which of what neighbours read is a goal that changes; what is said comes behind."""
+    n, moves = len(loop.model.state_names), isinstance(loop.places, MovingPlaces)
+    return tuple(range(n, n + len(loop.meter.measured) * moves))
+
+
+def memory_of(loop: Loop, leads: bool) -> ComponentMemory:
+    """Return the memory of one agent, as shapes."""
+    group = loop.laws.leaders if leads else loop.laws.followers
+    if not len(group):
+        return ComponentMemory(LawMemories((), ()))
+
+    def begun() -> ComponentMemory:
+        rows = [jnp.asarray(leaf)[:1] for leaf in agent_rows(loop)]
+        own = _of_one(loop, leads, jnp.zeros((), jnp.int32), rows, _Hears(_first(leads), ()))
+        return begin(own, jnp.zeros((1, len(loop.model.state_names)))).memory
+
+    return jax.eval_shape(begun)
+
+
+def memory_size(memory: PyTree) -> int:
+    """Return how many numbers a memory has; `Unsupported` of others, as a random key."""
+    leaves = jax.tree.leaves(memory)
     for leaf in leaves:
         if not jnp.issubdtype(leaf.dtype, jnp.floating):
             raise Unsupported(f"a memory of the type {leaf.dtype}")
@@ -143,163 +256,339 @@ def unflatten(like: PyTree, flat: Array | jax.Array) -> PyTree:
     )
 
 
-def signal_size(loop: Loop) -> int:
-    """Return how many numbers neighbours receive from an agent besides its state."""
-    size = numbers_said(loop.laws.follower, loop.model) if loop.laws.speech.signals else 0
-    return size or 0
-
-
-def _signal_of(loop: Loop, law: Law, x: jax.Array, offset: jax.Array, memory: Memory) -> jax.Array:
-    speech = loop.laws.speech
-    if not speech.signals:
-        return jnp.zeros(0, x.dtype)
-    return speech.of_one(law, loop.model, x, offset, memory)
-
+# ---- one agent -----------------------------------------------------------------------------------
 
 Entries: TypeAlias = Any
 """A traced array, an array of nodes, or a list of nodes."""
 
 
-class StepInputs(NamedTuple):
-    """What an agent's step depends on, entry by entry: arrays of nodes, or traced arrays."""
+@final
+class _Hears(IdealNetwork):
+    """What one agent hears, as it is given."""
 
-    t: Entries
+    estimate: Any
+
+    def receive(self, loop: Loop, memory: PyTree, known: Known) -> tuple[NetworkEstimate, PyTree]:
+        """Return it."""
+        return self.estimate, memory
+
+
+@final
+class _Reads(LateNetwork):
+    """What one agent makes of the newest packet, from which it knows of a leader."""
+
+    packet: Any
+
+    def receive(self, loop: Loop, memory: PyTree, known: Known) -> tuple[NetworkEstimate, PyTree]:
+        """Return it; what neighbours say is added up elsewhere."""
+        nobody = jnp.zeros(1, jnp.int32)
+        mail = self.rules.begin(nobody, 0, known.said, self.packet.content.shape[1])
+        own = known.own._replace(number=nobody)
+        mail = mail._replace(packet=self.packet)
+        return self.rules.read(loop, mail, known._replace(own=own)), memory
+
+
+@final
+class _Writes(LateNetwork):
+    """What one agent hears, and the letter that it writes, which is its memory."""
+
+    packet: Any
+    estimate: Any
+
+    def receive(self, loop: Loop, memory: PyTree, known: Known) -> tuple[NetworkEstimate, PyTree]:
+        """Return what it hears."""
+        return self.estimate, memory
+
+    def send(self, loop: Loop, memory: PyTree, known: Known, speech: LeaderSpeech) -> PyTree:
+        """Return the letter, and when it is written."""
+        packet, stamp = self.packet, known.clock.now
+        mail = Messages(known.said, packet.leader, packet)
+        content = self.rules.contents(loop, mail, known, speech)
+        rows = jnp.zeros(1, jnp.int32), stamp, known.said, content
+        difference = loop.laws.speech.difference(loop.model)
+        sent, _ = self.rules.write(mail, known.heard, *rows, difference)
+        return sent.value, sent.packet.content, sent.packet.stamp, stamp
+
+
+def _network_of(loop: Loop, leads: bool, inputs: "StepInputs", acts: bool) -> IdealNetwork:
+    """Return the network of one agent that hears what is given, before it acts or as it does."""
+    z, first, late = inputs.z[None], _first(leads), letter_sizes(loop)
+    if late is None:
+        return _Hears(first, NetworkEstimate(z, jnp.array([leads]), inputs.message[None]))
+    rules = dataclasses.replace(late.network.rules, leadership=first)
+    # Whom it follows: itself or another one.
+    leader = jnp.array([0 if leads else NOBODY])
+    content, stamp = inputs.packet[None, :-1], inputs.packet[-1:]
+    packet = LeaderPackets(leader, stamp, content, ())
+    if not acts:
+        return _Reads(first, rules, late.network.medium, packet)
+    _, _, expected, forward, _ = _parts(loop, inputs.sensed)
+    hops = jnp.zeros(1, jnp.int32)
+    heard = NetworkEstimate(z, jnp.array([leads]), forward[None], expected[None], hops, packet)
+    return _Writes(first, rules, late.network.medium, packet, heard)
+
+
+def _parts(loop: Loop, sensed: jax.Array) -> list[jax.Array]:
+    """Return what an agent knows before it acts, in parts of `sensed_sizes`."""
+    return jnp.split(sensed, np.cumsum(sensed_sizes(loop))[:-1].tolist())
+
+
+def _first(leads: bool) -> FixedLeaders:
+    return FixedLeaders(np.array([leads]))
+
+
+def _of_one(
+    loop: Loop, leads: bool, number: jax.Array, rows: Sequence[jax.Array], network: IdealNetwork
+) -> Loop:
+    """Return the loop of one agent of a number, with its row of `agent_rows`."""
+    tree = jax.tree.structure((loop.places.rows, loop.motion.rows))
+    places, plant = tree.unflatten(rows)
+    nobody = Links(Exchange(np.zeros(0, int), np.zeros(0, int), np.zeros(0)))
+    own = {"places": loop.places.of_rows(places), "graph": nobody, "network": network}
+    return one_row(loop, leads, number[None], plant, **own)
+
+
+class StepInputs(NamedTuple):
+    """What an agent's step depends on, entry by entry: arrays of nodes, or traced arrays.
+
+    Attributes:
+        step, steady: the number of the step, and whether it is in the steady window.
+        reference: that leaders follow (n,), or None.
+        x: its state (n,).
+        rows: its own of `agent_rows`, (1, ...) each.
+        memory: of its law, sensors and plant.
+        sensed: what it knows of its state, and what it says, where that is known before it acts.
+        z: what it hears of its neighbours.
+        message: what it is sent.
+        leader: its leader's state less its offset; None of a leader.
+        previous_cut: as in `LoopState`.
+        packet: the newest of a leader.
+    """
+
     step: Entries
     steady: Entries
     reference: Entries
     x: Entries
-    offset: Entries
+    rows: Entries
+    memory: ComponentMemory
+    sensed: Entries
     z: Entries
     message: Entries
-    memory: Memory
     leader: Entries
-    push: Entries
-    noise: Entries
     previous_cut: Entries
+    packet: Entries
 
 
-class StepOutputs(NamedTuple):
-    """The results of an agent's step."""
-
-    state: Entries
-    memory: Memory
-    cut: Entries
-    message: Entries
-    input: Entries
-    errors: Entries
-    tracking: Entries
-    outputs: Entries
-    effort: Entries
-    limited: Entries
-    unsettled: Entries
-    inside: Entries
-    deviation: Entries
-    chatter: Entries
-    signal: Entries
-    next_signal: Entries
+Outputs: TypeAlias = dict[str, Entries]
+"""Results of an agent's step by the name of their rows, and some others."""
 
 
-def agent_step(loop: Loop, leads: bool) -> Callable[[StepInputs], StepOutputs]:
-    """Return the step of a leader, or of another agent, as a function for JAX."""
-    law = loop.laws.leader if leads else loop.laws.follower
-    model, motion, meter = loop.model, loop.motion, loop.meter
-
-    def step(inputs: StepInputs) -> StepOutputs:
-        x, offset = inputs.x, inputs.offset
-        view = LocalView(inputs.t, x, offset, inputs.z, inputs.message, motion.dt)
-        rows = law, view, inputs.memory, leads
-        desired, u, memory, message = loop.laws.act(model, motion, *rows)
-        limited, cut = limit_sides(model, u, desired)
-        metered = meter.of_agent(inputs.step, inputs.steady, x, offset, inputs.leader, u)
-        tracking, outputs = jnp.zeros(2), jnp.zeros(len(model.output_names))
-        if inputs.reference is not None:
-            tracking, outputs = meter.of_leader(inputs.steady, x, offset, inputs.reference)
-        still = not motion.weather
-        field = motion.plant.velocity if still else motion.pushed(inputs.push, inputs.noise)
-        state, _ = motion.motors.integrate(field, (), x, u, motion)
-        return StepOutputs(
-            state=state,
-            memory=memory,
-            cut=cut,
-            message=message,
-            input=u,
-            errors=metered.errors,
-            tracking=tracking,
-            outputs=outputs,
-            effort=metered.effort,
-            limited=jnp.where(limited.any(), 1.0, 0.0),
-            unsettled=metered.unsettled,
-            inside=metered.inside,
-            deviation=metered.deviation,
-            chatter=jnp.where((cut * inputs.previous_cut < 0.0).any(), 1.0, 0.0),
-            signal=_signal_of(loop, law, x, offset, inputs.memory),
-            next_signal=_signal_of(loop, law, state, offset, memory),
-        )
-
-    return step
+def _flat(tree: PyTree) -> jax.Array:
+    return jnp.concatenate([jnp.zeros(0), *(jnp.ravel(leaf) for leaf in jax.tree.leaves(tree))])
 
 
-def body_of(
+def _moment(inputs: StepInputs) -> LoopState:
+    return LoopState(inputs.step, inputs.x[None], inputs.previous_cut[None], inputs.memory)
+
+
+def prior_step(own: Loop, inputs: StepInputs) -> Outputs:
+    """Return what an agent senses, says and reads before anybody acts."""
+    now, clock = _moment(inputs), Steps(inputs.step, own.motion.dt)
+    known, sensing, _ = hear(own, now, clock)
+    goal = _goal(own, clock, inputs)
+    goals = goal[np.array(own.meter.measured[: len(shown_goals(own))], int)]
+    heard, said = known.heard, known.said[0]
+    sensed = [known.own.x[0], said]
+    if own.network.late:
+        knows = heard.leads | (clock.age(heard.packet.stamp) < jnp.inf)
+        # What leaders receive of others' inputs is not used.
+        forward = jnp.where(heard.leads, 0.0, heard.feedforward[0])
+        sensed += [heard.leader[0], forward, jnp.where(knows, 1.0, 0.0)]
+    return {
+        "memory": _flat(inputs.memory._replace(sensing=sensing)),
+        "sensed": jnp.concatenate(sensed),
+        "mirror": jnp.concatenate([inputs.x - goal, goals, *[said] * (not own.network.late)]),
+    }
+
+
+def _goal(own: Loop, clock: Steps, inputs: StepInputs) -> jax.Array:
+    goals = own.places.goals(clock.t)
+    return inputs.rows[0][0] if goals is None else goals[0]
+
+
+def _acted(own: Loop, now: LoopState, clock: Steps, inputs: StepInputs) -> tuple[Control, Known]:
+    """Return what an agent does, and what it knows."""
+    if inputs.sensed is None:
+        known, sensing, network = hear(own, now, clock)
+    else:
+        x, said = (part[None] for part in _parts(own, inputs.sensed)[:2])
+        offsets = own.places.groups(own.model, own.laws, clock.t)
+        mine = Own(jnp.asarray(own.laws.numbers), x)
+        known = Known(clock, True, mine, offsets, said, own.graph.exchange)
+        heard, network = own.network.receive(own, (), known)
+        known, sensing = known._replace(heard=heard), now.memory.sensing
+    return act(own, now, known, sensing, network), known
+
+
+def agent_step(own: Loop, inputs: StepInputs) -> Outputs:
+    """Return what an agent does in a step."""
+    now, clock, meter = _moment(inputs), Steps(inputs.step, own.motion.dt), own.meter
+    x, goal = inputs.x, _goal(own, clock, inputs)
+    acted, known = _acted(own, now, clock, inputs)
+    u, cut = acted.inputs[0], acted.cut[0]
+    # A leader is its own leader, so that its error is zero.
+    leader = x - goal if inputs.leader is None else inputs.leader
+    metered = meter.of_agent(inputs.step, inputs.steady, x, goal, leader, u)
+    tracking, outputs = jnp.zeros(2), jnp.zeros(len(own.model.output_names))
+    if inputs.reference is not None:
+        tracking, outputs = meter.of_leader(inputs.steady, x, goal, inputs.reference)
+    plant = now.memory.plant, now.states, acted.inputs, inputs.step, known.own.number
+    states, plant = own.motion.advance(*plant)
+    memory = acted.memory._replace(plant=plant)
+    mirrors = dict[str, jax.Array]()
+    if inputs.sensed is None:
+        later = Steps(inputs.step + 1, own.motion.dt)
+        next_said = saying(own, states, memory.laws, later)[1][0]
+        mirrors = {"mirror": _shown(own, states[0] - goal, next_said)}
+        mirrors["mirror_before"] = _shown(own, x - goal, known.said[0])
+    elif own.network.late:
+        _, said, expected, _, knows = _parts(own, inputs.sensed)
+        mirrors["mirror_before"] = jnp.concatenate([said, expected, knows])
+        mirrors["letter"] = _flat(memory.network)
+    else:
+        goals = jnp.zeros(len(shown_goals(own)))
+        mirrors["mirror_before"] = jnp.concatenate([x - goal, goals, known.said[0]])
+    return mirrors | {
+        "state": states[0],
+        "memory": _flat(memory._replace(network=())),
+        "cut": cut,
+        "message": acted.message[0],
+        "input": u,
+        "errors": metered.errors,
+        "tracking": tracking,
+        "outputs": outputs,
+        "effort": metered.effort[None],
+        "limited": jnp.where(acted.limited, 1.0, 0.0),
+        "unsettled": metered.unsettled[None],
+        "inside": metered.inside,
+        "deviation": metered.deviation,
+        "chatter": jnp.where((cut * inputs.previous_cut < 0.0).any(), 1.0, 0.0)[None],
+    }
+
+
+def _shown(own: Loop, y: jax.Array, said: jax.Array) -> jax.Array:
+    return jnp.concatenate([y, said]) if own.laws.speech.signals else y
+
+
+# ---- its scalar operations -----------------------------------------------------------------------
+
+
+class Program(NamedTuple):
+    """What leaders or all others compute in a step.
+
+    Attributes:
+        body: of a step, after everybody has sensed and spoken if that is a part of its own.
+        prior: that part; None without one.
+        given: what the host computes ahead of both.
+    """
+
+    body: Body
+    prior: Body | None
+    given: HostPart
+
+
+def program_of(
     varying: VaryingNumbers, bits: int, rows: BlockRows, leads: bool, follows: bool
-) -> Body:
+) -> Program:
     """Return what the leaders or all others compute in a step.
 
     Args:
         varying: the loop of the run, and its numbers that differ between formations.
         bits: 64 or 32.
         rows: where the numbers of an agent are.
-        leads: whether it is the body of the leaders.
+        leads: whether it is that of the leaders.
         follows: whether they follow a reference, which is in the table.
 
     Raises:
-        Unsupported: the law or the model has no scalar operations.
+        Unsupported: a law or the model has no scalar operations.
     """
-    graph, loop = ScalarGraph(bits), varying.loop
-    law = loop.laws.leader if leads else loop.laws.follower
-    inputs = _step_inputs(loop, graph, rows, law, leads, follows)
-
-    def step(leaves: list[jax.Array], inputs: StepInputs) -> StepOutputs:
-        return agent_step(varying.filled(leaves), leads)(inputs)
-
+    graph, loop, given = ScalarGraph(bits), varying.loop, HostPart()
+    if not len(loop.laws.leaders if leads else loop.laws.followers):
+        return Program(Body(), Body() if len(rows.sensed) else None, given)
+    inputs = _step_inputs(loop, graph, rows, leads, leads and follows)
     leaves = varying.leaves(leaves_of(graph, "row", rows.varying))
-    results = lower(step, graph, [leaves, inputs])
-    shapes = jax.tree.structure(StepOutputs(*[0] * 16)._replace(memory=law.init()))
-    outputs: StepOutputs = shapes.unflatten([nodes(graph, part) for part in results])
-    memory = jax.tree.leaves(outputs.memory, is_leaf=lambda part: isinstance(part, list))
-    stores = {"state": outputs.state, "memory": sum(memory, start=[])}
-    # Where no limit is, nothing was ever cut.
-    if any(node is not graph.constant(0.0) for node in outputs.cut):
-        stores["cut"] = outputs.cut
-    # Steps ascend, so that the later one replaces the earlier one; -1 is no step.
-    earlier = leaves_of(graph, "row", rows.unsettled)
-    none = [graph.make("lt", step, 0.0) for step in outputs.unsettled]
-    pairs = zip(none, earlier, outputs.unsettled, strict=True)
-    stores["unsettled"] = [graph.make("select", *each) for each in pairs]
-    # Unless inputs are passed on from parents, nobody reads the message of a follower.
-    if leads or by_depth(loop):
-        stores["message"] = outputs.message
-    sums = {name: getattr(outputs, name) for name in ("effort", "limited", "chatter")}
-    sums |= {"errors": _before_and_in_window(inputs, outputs.errors)}
-    if leads and follows:
-        tracking = _before_and_in_window(inputs, outputs.tracking)
-        sums |= {"tracking": tracking, "outputs": outputs.outputs}
-    # Rows of the smallest numbers serve for the largest too.
-    minima = {"inside": outputs.inside, "lowest": outputs.deviation}
-    largest = {"peak": outputs.errors[: len(rows.peak)], "highest": outputs.deviation}
-    minima |= {name: [graph.make("sub", 0.0, x) for x in part] for name, part in largest.items()}
-    subtract = functools.partial(map, functools.partial(graph.make, "unfused_sub"))
-    body = Body(
-        stores=_placed(rows, stores),
-        sums=_placed(rows, sums),
-        minima=_placed(rows, minima),
-        on_request=_placed(rows, {"input": outputs.input}),
-        tape=dict(enumerate(inputs.x[list(loop.meter.paired)].tolist())),
-        mirror_before=[*subtract(inputs.x, inputs.offset), *outputs.signal],
-        mirror=[*subtract(outputs.state, inputs.offset), *outputs.next_signal],
-        difference=_difference(loop, graph, len(inputs.x), len(outputs.signal)),
-    )
+
+    def traced(step: Callable[[Loop, StepInputs], Outputs], inputs: StepInputs) -> Outputs:
+        def one(
+            keys: list[jax.Array], number: jax.Array, leaves: list[jax.Array], inputs: StepInputs
+        ) -> list[jax.Array]:
+            own = varying.filled(leaves, keys)
+            network = _network_of(own, leads, inputs, step is agent_step)
+            results.update(step(_of_one(own, leads, number, inputs.rows, network), inputs))
+            return [results[name] for name in sorted(results)]
+
+        results = Outputs()
+        known = [*varying.keys_of(loop)], np.zeros((), np.int32)
+        parts = lower(one, graph, [leaves, inputs], known, given)
+        return {k: nodes(graph, part) for k, part in zip(sorted(results), parts, strict=True)}
+
+    prior = None
+    if len(rows.sensed):
+        mine = traced(prior_step, inputs._replace(sensed=None))
+        prior = Body(stores=_placed(rows, mine, ("memory", "sensed")), mirror=mine["mirror"])
+        prior = _finished(graph, prior)
+    body = _body(loop, graph, rows, inputs, traced(agent_step, inputs), leads, leads and follows)
+    return Program(_finished(graph, body), prior, given)
+
+
+def _finished(graph: ScalarGraph, body: Body) -> Body:
     body = body._replace(exceptions=exceptions_of(graph, body))
     return body.map_nodes(factored(body.all()))
+
+
+def _body(
+    loop: Loop,
+    graph: ScalarGraph,
+    rows: BlockRows,
+    inputs: StepInputs,
+    outputs: Outputs,
+    leads: bool,
+    tracks: bool,
+) -> Body:
+    """Return a step by its results."""
+    stores = _placed(rows, outputs, ("state", "memory"))
+    # Where no limit is, nothing was ever cut.
+    if any(node is not graph.constant(0.0) for node in outputs["cut"]):
+        stores |= _placed(rows, outputs, ("cut",))
+    # Steps ascend, so that the later one replaces the earlier one; -1 is no step.
+    earlier = leaves_of(graph, "row", rows.unsettled)
+    none = [graph.make("lt", step, 0.0) for step in outputs["unsettled"]]
+    pairs = zip(none, earlier, outputs["unsettled"], strict=True)
+    last = {"unsettled": [graph.make("select", *each) for each in pairs]}
+    stores |= _placed(rows, last, ("unsettled",))
+    # Unless inputs are passed on from parents, nobody reads the message of a follower.
+    if (leads or by_depth(loop)) and not loop.network.late:
+        stores |= _placed(rows, outputs, ("message",))
+    sums = {name: outputs[name] for name in ("effort", "limited", "chatter")}
+    sums |= {"errors": _before_and_in_window(inputs, outputs["errors"])}
+    if tracks:
+        tracking = _before_and_in_window(inputs, outputs["tracking"])
+        sums |= {"tracking": tracking, "outputs": outputs["outputs"]}
+    # Rows of the smallest numbers serve for the largest too.
+    minima = {"inside": outputs["inside"], "lowest": outputs["deviation"]}
+    largest = {"peak": outputs["errors"][: len(rows.peak)], "highest": outputs["deviation"]}
+    minima |= {name: [graph.make("sub", 0.0, x) for x in part] for name, part in largest.items()}
+    return Body(
+        stores=stores,
+        sums=_placed(rows, sums, sums),
+        minima=_placed(rows, minima, minima),
+        on_request=_placed(rows, outputs, ("input",)),
+        tape=dict(enumerate(inputs.x[list(loop.meter.paired)].tolist())),
+        mirror_before=outputs["mirror_before"],
+        mirror=outputs.get("mirror", ()),
+        letter=outputs.get("letter", ()),
+        difference=_difference(loop, graph),
+    )
 
 
 def _before_and_in_window(inputs: StepInputs, sums: list[Node]) -> list[Node]:
@@ -308,45 +597,78 @@ def _before_and_in_window(inputs: StepInputs, sums: list[Node]) -> list[Node]:
     return [all_.graph.make("select", inputs.steady[()], 0.0, all_), steady]
 
 
-def _difference(loop: Loop, graph: ScalarGraph, states: int, signals: int) -> list[Node]:
-    """Return the differences of what neighbours read: of states by the model, of signals plain."""
-    # Of the first loop's model: the difference of two states is the same for all formations.
+def _link(loop: Loop, late: LetterSizes, graph: ScalarGraph) -> list[Node]:
+    """Return the difference to what an agent makes of the last letter that came by a link."""
+    s, model = late.value, loop.model
+
+    def difference(step: jax.Array, mine: jax.Array, kept: jax.Array) -> jax.Array:
+        said, leader, knows = mine[None, :s], mine[None, s:-1], mine[-1:] != 0.0
+        clock, stamp = Steps(step, loop.motion.dt), kept[-1:]
+        nobody, none = np.zeros(1, np.int32), Own(jnp.zeros(1, jnp.int32), said)
+        links = Exchange(nobody, nobody, np.ones(1))
+        known = Known(clock, True, none, loop.places.groups(model, loop.laws, clock.t), said, links)
+        mail = Messages(kept[None, :s], jnp.zeros(1, jnp.int32), None, stamp)  # type: ignore[arg-type]
+        rows = mail, clock.age(stamp), leader, knows, known
+        received, _ = late.network.rules.received(*rows)
+        return loop.laws.speech.difference(model)(said, received)[0]
+
+    step = single(graph.leaf("step", uniform=True))
+    pairs = (("self", 2 * s + 1), ("link", s + 1))
+    [found] = lower(difference, graph, [step, *(leaves_of(graph, k, range(n)) for k, n in pairs)])
+    return nodes(graph, found)
+
+
+def _difference(loop: Loop, graph: ScalarGraph) -> list[Node]:
+    """Return the differences of what neighbours read, of which the last are of what is said."""
+    late = letter_sizes(loop)
+    if late is not None:
+        return _link(loop, late, graph)
+    # Of the first loop's: the difference of two states is the same for all formations.
+    n, s, shown = len(loop.model.state_names), said_size(loop), shown_size(loop)
     kinds = "self", "neighbour"
-    mine, theirs = (leaves_of(graph, kind, range(states + signals)) for kind in kinds)
-    [difference] = lower(loop.model.difference, graph, [mine[:states], theirs[:states]])
-    plain = zip(mine[states:], theirs[states:], strict=True)
-    return [*nodes(graph, difference), *(graph.make("sub", a, b) for a, b in plain)]
+    mine, theirs = (leaves_of(graph, kind, range(n + shown)) for kind in kinds)
+    speech, model = loop.laws.speech, loop.model
+
+    def difference(a: jax.Array, b: jax.Array) -> jax.Array:
+        return speech.difference(model)(a[None], b[None])[0]
+
+    [said] = lower(difference, graph, [mine[-s:], theirs[-s:]])
+    plain = zip(mine[:-s], theirs[:-s], strict=True)
+    return [*(graph.make("sub", a, b) for a, b in plain), *nodes(graph, said)]
 
 
 def _step_inputs(
-    loop: Loop, graph: ScalarGraph, rows: BlockRows, law: Law, leads: bool, follows: bool
+    loop: Loop, graph: ScalarGraph, rows: BlockRows, leads: bool, tracks: bool
 ) -> StepInputs:
-    n, signals = len(rows.state), signal_size(loop)
+    n = len(rows.state)
 
     def row(places: range) -> np.ndarray:
         return leaves_of(graph, "row", places)
 
-    x, offset, size = row(rows.state), row(rows.offset), memory_size(law)
+    x, offset, memory = row(rows.state), row(rows.offset), memory_of(loop, leads)
+    shown = said_size(loop) if loop.network.late else n + shown_size(loop)
     # A truth and not a number, since it chooses between sums.
     late = graph.make("ne", graph.leaf("steady", uniform=True), 0.0)
+    ends = [*itertools.accumulate(map(row_size, agent_rows(loop)))]
+    own = np.concatenate([offset, row(rows.agent)])
+    shapes = [(1, *np.shape(leaf)[1:]) for leaf in agent_rows(loop)]
+    pairs = zip([0, *ends[:-1]], ends, shapes, strict=True)
     return StepInputs(
-        t=single(graph.leaf("time", uniform=True)),
         step=single(graph.leaf("step", uniform=True)),
         steady=single(late),
-        reference=leaves_of(graph, "table", range(n), True) if leads and follows else None,
+        reference=leaves_of(graph, "table", range(n), True) if tracks else None,
         x=x,
-        offset=offset,
-        z=leaves_of(graph, "z", range(n, n + signals) if signals else range(n)),
+        rows=[own[a:b].reshape(shape) for a, b, shape in pairs],
+        memory=unflatten(memory, row(rows.memory[: memory_size(memory)])),
+        sensed=row(rows.sensed) if len(rows.sensed) else None,
+        z=leaves_of(graph, "z", range(shown - said_size(loop), shown)),
         # A leader receives no input of another agent.
-        message=np.zeros(len(rows.input))
+        message=np.zeros(len(rows.message))
         if leads
         else leaves_of(graph, "message", range(len(rows.message))),
-        memory=unflatten(law.init(), row(rows.memory[:size])),
-        # A leader is its own leader, so that its error is zero.
-        leader=x - offset if leads else leaves_of(graph, "leader", range(n)),
-        push=row(rows.push) if len(rows.push) else None,
-        noise=row(rows.noise) if len(rows.noise) else None,
+        leader=None if leads else leaves_of(graph, "leader", range(n)),
         previous_cut=row(rows.cut),
+        packet=row(rows.packet),
     )
 
 
@@ -366,12 +688,16 @@ def single(node: Node) -> np.ndarray:
     return array
 
 
-def _placed(rows: BlockRows, named: dict[str, list[Node]]) -> dict[int, Node]:
-    return {
-        row: node
-        for name, entries in named.items()
-        for row, node in zip(getattr(rows, name), entries, strict=name != "memory")
-    }
+def _placed(
+    rows: BlockRows, results: dict[str, list[Node]], names: Iterable[str]
+) -> dict[int, Node]:
+    """Return some results by their rows; what is as it was is not stored."""
+    pairs = (
+        (row, node)
+        for name in names
+        for row, node in zip(getattr(rows, name), results[name], strict=name != "memory")
+    )
+    return {row: node for row, node in pairs if node.value != ("row", row)}
 
 
 _SIZES = (1e9, 1e6, 1e3)
@@ -398,5 +724,5 @@ def _between(graph: ScalarGraph, body: Body) -> Iterator[Node]:
             break
     else:
         raise Unsupported("a `difference` with angles of which no bound is known")
-    for mine in body.mirror_before:
+    for mine in (*body.mirror_before, *body.letter):
         yield graph.make("lt", size, graph.make("abs", mine))

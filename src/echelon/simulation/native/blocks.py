@@ -78,6 +78,7 @@ class Places(abc.ABC):
         row_major: whether what neighbours read is stored row by row over all positions.
         reach: of blocks, if leaders may be ahead of all others and it was measured.
         shifts: `shifts` and `edge_shifts` of `Plan`.
+        listens_first: as in `Plan`.
     """
 
     loop: Loop
@@ -90,6 +91,7 @@ class Places(abc.ABC):
     row_major: bool
     reach: BlockReach | None = None
     shifts: Shifts = ((), ())
+    listens_first: bool = False
 
     @property
     def edge_blocks(self) -> int:
@@ -313,24 +315,36 @@ def neighbour_slots(
         and weights (rows, slots, lanes).
     """
     exchange, place = loop.graph.exchange, places.position.astype(np.int32)
+    starts, there, edge = _slots(loop, places, blocks)
+    itself = np.arange(len(places.agents), dtype=np.int32).reshape(-1, places.lanes)[blocks]
+    block = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+    # An agent with fewer neighbours reads itself; the difference is 0.
+    positions = np.where(there, place[np.asarray(exchange.senders)][edge], itself[block])
+    weights = np.atleast_2d(np.asarray(exchange.weights))
+    if (weights == 1.0).all():
+        return starts, positions, np.repeat(there[None], len(weights), axis=0).astype(float)
+    return starts, positions, np.where(there, weights[:, edge], 0.0)
+
+
+def link_slots(loop: Loop, places: Places) -> Array:
+    """Return the link of each slot of all agents, (slots, lanes); -1 where there is none."""
+    _, there, edge = _slots(loop, places, slice(None))
+    return np.where(there, edge, -1)
+
+
+def _slots(loop: Loop, places: Places, blocks: Array | slice) -> tuple[Array, Array, Array]:
+    """Return the first slot of each block, and of all slots whether there is a link, and which."""
+    exchange, place = loop.graph.exchange, places.position.astype(np.int32)
     # By position and not by number, so that memory is read from end to end.
     first, order = grouped(place[np.asarray(exchange.receivers)], len(places.agents))
-    senders = place[np.asarray(exchange.senders)][order]
     agents = places.agents.reshape(-1, places.lanes)[blocks]
     begin, degrees = first[place[agents]], np.diff(first)[place[agents]]
-    itself = np.arange(len(places.agents), dtype=np.int32).reshape(-1, places.lanes)[blocks]
     slots = degrees.max(axis=1)
     starts = np.concatenate([[0], np.cumsum(slots)]).astype(np.int64)
     block = np.repeat(np.arange(len(agents)), slots)
     k = (np.arange(starts[-1]) - starts[block]).astype(np.int32)[:, None]
     there = k < degrees[block]
-    edge = np.minimum(begin[block] + k, len(senders) - 1)
-    # An agent with fewer neighbours reads itself; the difference is 0.
-    positions = np.where(there, senders[edge], itself[block])
-    weights = np.atleast_2d(np.asarray(exchange.weights))
-    if (weights == 1.0).all():
-        return starts, positions, np.repeat(there[None], len(weights), axis=0).astype(float)
-    return starts, positions, np.where(there, weights[:, order][:, edge], 0.0)
+    return starts, there, order[np.minimum(begin[block] + k, len(order) - 1)]
 
 
 def edge_blocks(loop: Loop, places: SwarmBlocks, dtype: np.dtype, far: int) -> tuple[Array, Array]:

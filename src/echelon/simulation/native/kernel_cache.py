@@ -8,10 +8,17 @@ import numpy as np
 from echelon.core.cache import BoundedCache
 from echelon.core.numerics import precision
 from echelon.laws.law import Travels
-from echelon.simulation.codegen import Code, Plan, has_flag, program, shared
-from echelon.simulation.native.agent_step import BlockRows, body_of, signal_size
+from echelon.simulation.codegen import Code, Letters, Plan, has_flag, program, shared
+from echelon.simulation.native.agent_step import (
+    BlockRows,
+    letter_sizes,
+    program_of,
+    shown_goals,
+    shown_size,
+)
 from echelon.simulation.native.blocks import Shifts
 from echelon.simulation.native.varying import VaryingNumbers
+from echelon.simulation.scalars import HostPart
 from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.turns import by_depth
 
@@ -39,12 +46,22 @@ class Kernel(NamedTuple):
         rows: that it works on.
         plan: that it was compiled from.
         uniform_count: how many numbers are the same for all agents at a step.
+        given: what the host computes ahead for leaders and all others.
     """
 
     code: Code
     rows: BlockRows
     plan: Plan
     uniform_count: int
+    given: tuple[HostPart, HostPart]
+
+
+def letters_of(loop: Loop, rows: BlockRows) -> Letters | None:
+    """Return what is sent over a network on which it takes time; None over another one."""
+    late = letter_sizes(loop)
+    if late is None:
+        return None
+    return Letters(late.total, late.value, rows.packet, late.network.medium.slots)
 
 
 def plan_of(
@@ -56,43 +73,61 @@ def plan_of(
     weighted: bool,
     apart: bool = True,
     shifts: Shifts = ((), ()),
-) -> Plan:
-    """Return the plan of loops; `apart` is false if all goals are one; or raise `Unsupported`."""
+) -> tuple[Plan, tuple[HostPart, HostPart]]:
+    """Return the plan of loops, and what is given; `apart` is false if all goals are one.
+
+    Raises:
+        Unsupported: there is no native code for them.
+    """
     loop, tracks = varying.loop, follows(varying.loop)
     n, one_leader = len(rows.state), len(loop.laws.leaders) == 1
+    first, others = (program_of(varying, bits, rows, leads, tracks) for leads in (True, False))
+    bodies = (first.body, others.body)
+    if batched:
+        bodies = tuple(body._replace(tape={}) for body in bodies)
+    weights = np.asarray(loop.graph.exchange.weights)
     plan = Plan(
         bits=bits,
         lanes=LANES[bits],
         batched=batched,
         row_major=row_major,
         rows=rows.total,
-        width=n + signal_size(loop),
-        first=body_of(varying, bits, rows, True, tracks),
-        others=body_of(varying, bits, rows, False, tracks),
+        width=n + shown_size(loop),
+        first=bodies[0],
+        others=bodies[1],
         message_start=rows.message.start,
         message_size=len(rows.message),
         one_source=one_leader and by_depth(loop) is None,
         one_leader=one_leader,
-        weighted=weighted or bool((np.asarray(loop.graph.exchange.weights) != 1.0).any()),
+        weighted=weighted or bool((weights != 1.0).any()) or loop.network.late and not batched,
         edges=loop.meter.measured,
         apart=apart,
         shifts=shifts[0],
         edge_shifts=shifts[1],
         exception_row=rows.exception.start,
         table=n if tracks else 0,
-        dt=loop.motion.dt,
-        tape_rows=len(loop.meter.paired),
+        goals=shown_goals(loop),
+        letters=letters_of(loop, rows),
+        given=max(first.given.size, others.given.size),
+        prior_first=first.prior,
+        prior_others=others.prior,
+        tape_rows=0 if batched else len(loop.meter.paired),
+        paired=tuple(rows.state[k] for k in loop.meter.paired) if batched else (),
     )
     # A leader that receives nothing waits for nobody.
-    ahead = not batched and by_depth(loop) is None and not plan.first.reads_neighbours
-    return plan._replace(width=plan.width + has_flag(plan), leaders_ahead=ahead)
+    alone = not plan.first.reads_neighbours and not plan.listens_first
+    ahead = not batched and by_depth(loop) is None and alone
+    plan = plan._replace(width=plan.width + has_flag(plan), leaders_ahead=ahead)
+    return plan, (first.given, others.given)
 
 
-def compiled(rows: BlockRows, plan: Plan, codes: BoundedCache[Code]) -> Kernel:
+def compiled(
+    rows: BlockRows, plan: Plan, given: tuple[HostPart, HostPart], codes: BoundedCache[Code]
+) -> Kernel:
     """Return the kernel of a plan; `codes` by text, since another graph has the same code."""
     text = program(plan)
     code = codes.get_or_make(text, lambda: Code(text))
-    return Kernel(code, rows, plan, len(shared(plan)))
+    return Kernel(code, rows, plan, len(shared(plan)), given)
 
 
 @final
@@ -121,14 +156,15 @@ class Kernels:
         shifts: Shifts = ((), ()),
     ) -> Kernel:
         """Return the kernel of loops, `weighted` if weights may change; as `plan_of`."""
-        # Also by wind and noise, which have rows only if they exist.
-        wind, signature = jax.tree.structure(varying.loop.motion.weather), varying.signature
-        key = (signature, wind, bits, LANES[bits], batched, row_major, weighted, apart, shifts)
+        signature = varying.signature
+        # Also by what has rows of agents, only if it exists.
+        own = jax.tree.structure((varying.loop.places, varying.loop.motion.rows))
+        key = (signature, own, bits, LANES[bits], batched, row_major, weighted, apart, shifts)
 
         def make() -> Kernel:
             rows = BlockRows.of(varying.loop, varying.count)
-            plan = plan_of(varying, rows, bits, batched, row_major, weighted, apart, shifts)
-            return compiled(rows, plan, self.codes)
+            parts = plan_of(varying, rows, bits, batched, row_major, weighted, apart, shifts)
+            return compiled(rows, *parts, self.codes)
 
         return self._kernels.get_or_make(None if signature is None else key, make)
 

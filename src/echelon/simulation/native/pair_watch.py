@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from echelon.core.types import Array
 from echelon.simulation.codegen import aligned
-from echelon.simulation.native.blocks import Places
+from echelon.simulation.native.blocks import FormationBlocks, Places
 
 _SPAN, _NUMBERS, _TIE = 32, 4_000_000, 1e-9
 """Steps compared at once, recorded numbers, and the relative difference that is not resolved."""
@@ -25,21 +25,33 @@ class PairWatch:
         formations: how many follow each other.
         dtype: of the numbers.
         steps: of a call, at most.
+        rows: of a block.
     """
 
     def __init__(
-        self, places: Places, axes: int, formations: int, dtype: np.dtype, steps: int
+        self, places: Places, axes: int, formations: int, dtype: np.dtype, steps: int, rows: int
     ) -> None:
+        watched = axes
+        axes = 0 if places.batched else axes
         numbers = places.blocks * axes * places.lanes
         self.steps = max(1, min(steps, _NUMBERS // max(1, numbers)))
         self.tape = aligned((self.steps, places.blocks, axes, places.lanes), dtype)
         self.position, self.formations = places.position, formations
-        self.pairs = np.triu_indices(len(places.position) // formations if numbers else 0, 1)
+        agents = len(places.position) // formations if watched else 0
+        self.pairs = np.triu_indices(agents, 1)
+        # Where vectors hold many formations, the kernel compares the few pairs of each.
+        count, kernel = len(self.pairs[0]), places.batched and watched > 0
+        shape = places.groups, count * kernel, 2, places.lanes
+        self.least = aligned(shape, dtype)
+        block = places.swarm.position if isinstance(places, FormationBlocks) else places.position
+        ends = np.stack([block[end] for end in self.pairs], axis=1) * rows * places.lanes
+        self.ends = np.ascontiguousarray(ends, np.int32)
         self.clear()
 
     def clear(self) -> None:
         """Forget all steps."""
-        count = self.formations if self.tape.size else 0
+        count = self.formations if self.tape.size or self.least.size else 0
+        self.least[:, :, 0], self.least[:, :, 1] = np.inf, 0.0
         self.used, self.first = 0, 0
         self.closest, self.met = np.full(count, np.inf), np.zeros((count, 3))
 
@@ -59,8 +71,18 @@ class PairWatch:
 
     def terms(self) -> dict[str, Array]:
         """Return the terms `closest` and `met` of the sums."""
+        if self.least.size:
+            self._compare()
         self._search()
         return {"closest": self.closest.copy(), "met": self.met.copy()}
+
+    def _compare(self) -> None:
+        """Find the closest pairs of those that the kernel kept."""
+        squares, steps = self.least.transpose(2, 0, 3, 1).reshape(2, -1, len(self.pairs[0]))
+        squares, formations = squares[: self.formations].astype(float), np.arange(self.formations)
+        pair = squares.argmin(axis=1)
+        step = steps[formations, pair] - self.first
+        self._keep(formations, np.sqrt(squares[formations, pair]), step, pair)
 
     def _places(self) -> Float[np.ndarray, "d S K F N"]:
         """Return the recorded positions in K spans of S steps; the last step fills its span."""

@@ -12,12 +12,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from echelon.agents.world.disturbance import Wind
+from echelon.core.compiled import cached_jit
 from echelon.core.types import Array
 from echelon.simulation.codegen import aligned, stride
-from echelon.simulation.native.agent_step import signal_size, unflatten
+from echelon.simulation.native.agent_step import (
+    agent_rows,
+    listens_first,
+    memory_of,
+    memory_size,
+    shown_size,
+)
 from echelon.simulation.native.blocks import FormationBlocks, Places, SwarmBlocks, neighbour_slots
+from echelon.simulation.native.given_table import GivenTable
 from echelon.simulation.native.kernel_cache import KERNELS, LANES
+from echelon.simulation.native.mail_table import MailTable
 from echelon.simulation.native.pair_watch import PairWatch
 from echelon.simulation.native.threads import ThreadPool
 from echelon.simulation.native.varying import VaryingNumbers
@@ -25,8 +33,8 @@ from echelon.simulation.scalars import needed
 from echelon.simulation.step.drive import Chunk, Stepper
 from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.meter import ALWAYS, Sums
-from echelon.simulation.step.records import LawMemories, LoopState
-from echelon.simulation.step.sequence import begin, begin_forgetful, said_by
+from echelon.simulation.step.records import ComponentMemory, LawMemories, LoopState
+from echelon.simulation.step.sequence import begin, said_by
 
 _AGENT_STEPS, _FEWEST = 2_000_000, 4
 """Agent steps of a chunk, which take some hundredths of a second, and its fewest steps."""
@@ -79,20 +87,23 @@ class NativeStepper(Stepper):
         self.followers = (first + self.loop.laws.followers).reshape(-1)
         row_major, weights_change = self.places.row_major, variant is not None
         apart = weights_change or any(np.any(loop.meter.spacings) for loop in loops)
-        self.code, self.rows, self.plan, self.uniform_count = KERNELS.of(
+        self.places.listens_first = listens_first(self.loop)
+        self.code, self.rows, self.plan, self.uniform_count, parts = KERNELS.of(
             self.varying, bits, batched, row_major, weights_change, apart, self.places.shifts
         )
-        self._signals = signal_size(self.loop)
+        self.given = GivenTable(self.varying, loops, parts, self.places, self.plan, self.dtype)
+        letters = self.plan.letters
+        self.mail = letters and MailTable(loops, self.places, letters, self.dtype)
         # Once, because to call a law takes as long as many small steps.
-        self.memories = LawMemories(self.loop.laws.leader.init(), self.loop.laws.follower.init())
+        self.memories = [memory_of(self.loop, leads) for leads in (True, False)]
         self._work = 1 + len(needed(self.plan.others.results()))
         self._reserve()
         # The moment in the blocks: a chunk that continues from it need not be written there.
         self._moment: LoopState | None = None
-        self._hold, self._fallback_step = -1, -1
+        self._fallback_step = -1
         axes, count = len(self.loop.meter.paired), len(loops)
-        self._pairs = PairWatch(self.places, axes, count, self.dtype, _STEPS)
-        self._draws_ahead = max(1, min(_AHEAD, _AT_ONCE // len(states)))
+        rows = self.plan.rows
+        self._pairs = PairWatch(self.places, axes, count, self.dtype, _STEPS, rows)
 
     # ---- memory ----
 
@@ -157,22 +168,66 @@ class NativeStepper(Stepper):
     def start(self) -> LoopState:
         """Return the moment at which the run begins."""
         states = np.asarray(self.states, self.dtype)
-        if not len(self.rows.memory):
-            return begin_forgetful(self.loop, states)
-        pairs = zip(self.loops, np.split(np.asarray(self.states), len(self.loops)), strict=True)
-        moments = [jax.tree.map(np.asarray, begin(loop, jnp.asarray(x))) for loop, x in pairs]
-        return self._moment_of(
-            0,
-            states,
-            jax.tree.map(lambda *leaves: np.concatenate(leaves), *(m.memory.laws for m in moments)),
-            np.zeros((len(states), len(self.rows.input)), np.int8),
-        )
+        memory = self._memory(self._begun() if len(self.rows.memory) else states[:, :0])
+        if self.mail is not None:
+            self.mail.clear()
+            packets = np.zeros((len(states), len(self.rows.packet)))
+            memory = memory._replace(network=self.mail.memory(0, packets))
+        cut = np.zeros((len(states), len(self.rows.input)), np.int8)
+        return self._moment_of(0, states, memory, cut)
 
-    def _moment_of(self, step: int, states: Any, laws: Any, cut: Any) -> LoopState:
-        """Return the moment of all formations: in the worlds of native code laws alone remember."""
-        now = begin_forgetful(self.loop, states)
+    def _begun(self) -> Array:
+        """Return the memories at the beginning, a row of each agent."""
+        by_formation = np.asarray(self.states).reshape(len(self.loops), -1, len(self.rows.state))
+        if not self.varying.count:
+            memory = jax.tree.map(np.asarray, begin_many(self.loop, by_formation).memory)
+            leaves = (memory.laws, memory.sensing, memory.plant)
+            memory = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), leaves)
+            return self._rows_of(*memory)
+        pairs = zip(self.loops, by_formation, strict=True)
+        all_ = [begin(loop, jnp.asarray(x)).memory for loop, x in pairs]
+        trees = [(each.laws, each.sensing, each.plant) for each in all_]
+        return self._rows_of(*jax.tree.map(lambda *leaves: np.concatenate(leaves), *trees))
+
+    @property
+    def _groups(self) -> tuple[Array, Array]:
+        return self.leaders, self.followers
+
+    def _rows_of(self, laws: LawMemories, sensing: Any, plant: Any) -> Array:
+        """Return memories as rows (N, rows.memory)."""
+        rows = np.zeros((len(self.states), len(self.rows.memory)))
+        for agents, law in zip(self._groups, laws, strict=True):
+            own = jax.tree.map(lambda leaf, some=agents: np.asarray(leaf)[some], (sensing, plant))
+            leaves = [
+                np.asarray(leaf).reshape(len(agents), -1) for leaf in jax.tree.leaves((law, own))
+            ]
+            flat = np.concatenate([np.zeros((len(agents), 0)), *leaves], axis=1)
+            rows[agents, : flat.shape[1]] = flat
+        return rows
+
+    def _memory(self, rows: Array) -> ComponentMemory:
+        """Return the memory of rows (N, rows.memory)."""
+        laws, bodies = list[Any](), list[Any]()
+        for k, (like, agents) in enumerate(zip(self.memories, self._groups, strict=True)):
+            size = memory_size(like.laws)
+            laws.append(_unflatten(like.laws[k], rows[agents, :size]) if len(agents) else like.laws)
+            if len(agents):
+                tree = like.sensing, like.plant
+                bodies.append((agents, _unflatten(tree, rows[agents, size:])))
+
+        def joined(*leaves: Array) -> Array:
+            whole = np.empty((len(rows), *leaves[0].shape[1:]), leaves[0].dtype)
+            for (agents, _), leaf in zip(bodies, leaves, strict=True):
+                whole[agents] = leaf
+            return whole
+
+        sensing, plant = jax.tree.map(joined, *(tree for _, tree in bodies))
+        return ComponentMemory(LawMemories(*laws), sensing, plant)
+
+    def _moment_of(self, step: int, states: Any, memory: ComponentMemory, cut: Any) -> LoopState:
+        """Return the moment of all formations."""
         stamp: Any = np.asarray(step, np.int32)
-        return now._replace(step=stamp, cut=cut, memory=now.memory._replace(laws=laws))
+        return LoopState(stamp, states, cut, memory)
 
     def advance(self, now: LoopState, counts: Array, reference: Array | None) -> Chunk:
         """Store frames and take steps; divergence is detected afterwards."""
@@ -190,7 +245,10 @@ class NativeStepper(Stepper):
         self.loop, self.loops = loop, [loop]
         self.varying.replace_loop(loop)
         self.edge_weights[:] = neighbour_slots(loop, self.places)[2]
-        # Offsets, numbers and the wind are written with a moment.
+        self.given.forget([loop])
+        if self.mail is not None:
+            self.mail.forget([loop])
+        # Offsets and numbers are written with a moment.
         self._moment = None
 
     def _advance(self, now: LoopState, counts: Array, reference: Array | None) -> Chunk:
@@ -222,8 +280,9 @@ class NativeStepper(Stepper):
 
     def _read_next_inputs(self, step: int, first: int, table: Array | None, out: Array) -> None:
         """Read the inputs of a step that is not taken."""
-        arrays = (self.blocks, self.edges, *self.mirrors)
-        copies, hold = [array.copy() for array in arrays], self._hold
+        letters = (self.mail.ring, self.mail.mail) if self.mail is not None else ()
+        arrays = (self.blocks, self.edges, *self.mirrors, *letters, self._pairs.least)
+        copies = [array.copy() for array in arrays]
         self._run(step, 1, first, table)
         self._read(self.rows.input, out)
         self._find_inexact()
@@ -231,12 +290,10 @@ class NativeStepper(Stepper):
         self.mirrors.reverse()
         for array, before in zip(arrays, copies, strict=True):
             array[:] = before
-        # The draws of that step are no longer in the blocks.
-        self._hold = hold
 
     def _run(self, step: int, steps: int, first: int, table: Array | None) -> None:
-        """Take steps, one draw and one stretch at a time; the rows then have the first inputs."""
-        weather, input_step = self.loop.motion.weather, step
+        """Take steps, one stretch at a time; the rows then have the first inputs."""
+        input_step = step
         most = _TASKS // len(self.places.segments)
         if self.plan.leaders_ahead:
             size = self.plan.mirror + self.plan.message_size * self.plan.lanes
@@ -248,28 +305,10 @@ class NativeStepper(Stepper):
             count = min(steps, self._pairs.steps, max(1, most), constant)
             later = self._events[self._events > step]
             count = min(count, int(later[0]) - step) if len(later) else count
-            for wind in weather:
-                hold = int(wind.window)
-                self._draw(step // hold, hold)
-                count = min(count, hold - step % hold)
+            count = min(count, self.given.left(step))
+            count = count if self.mail is None else min(count, self.mail.left(step))
             self._call(step, count, input_step, None if table is None else table[step - first :])
             step, steps = step + count, steps - count
-
-    def _draw(self, number: int, hold: int) -> None:
-        if number == self._hold:
-            return
-        count = self._draws_ahead
-        first, at = number - number % count, number % count
-        if first != self._hold - self._hold % count or self._hold < 0:
-            # Numbers beyond the end of the run may wrap: they are not used.
-            steps = ((first + np.arange(count)) * hold).astype(np.int32)
-            winds = [loop.motion.weather[0] for loop in self.loops]
-            drawn = _drawn(winds, steps, np.arange(len(self.loop.places.offsets)))
-            self._draws = [part if part is None else np.asarray(part) for part in drawn]
-        self._hold = number
-        for rows, part in zip((self.rows.push, self.rows.noise), self._draws, strict=True):
-            if part is not None:
-                self._write(rows, part[at].reshape(len(self.states), -1))
 
     def _call(self, step: int, steps: int, input_step: int, table: Array | None) -> None:
         """Run the kernel; each step exchanges the two mirrors."""
@@ -287,12 +326,21 @@ class NativeStepper(Stepper):
         values["first_steady"] = int(self.loop.meter.first_steady)
         now, after = self.mirrors
         firsts = {"rows": self.blocks, "mirror": now, "next_mirror": after, "edges": self.edges}
+        if self.plan.given:
+            firsts["ahead"] = self.given.of(step)
+            values["ahead_step"] = firsts["ahead"].size
+        if self.mail is not None:
+            firsts |= {"ring": self.mail.ring, "mail": self.mail.mail}
+            firsts["arrivals"], sends = self.mail.of(step)
+            values |= {"sends": sends.ctypes.data, "arrivals_step": firsts["arrivals"].size}
+        firsts["pairs"], values["pair_count"] = self._pairs.least, self._pairs.least.shape[1]
+        values["pair_ends"] = self._pairs.ends.ctypes.data
         tape = self._pairs.room(step, steps)
         if tape.size:
             values["tape_step"], firsts["tape"] = tape.size, tape
         uniform_values = np.empty(steps * self.uniform_count, self.dtype)
         self.threads.run(self.code, values, firsts, uniform_values)
-        if steps % 2:
+        if steps % 2 and not plan.listens_first:
             self.mirrors.reverse()
         if plan.leaders_ahead:
             self._leader_mirror[:] = arrays["leader_mirrors"][-1]
@@ -336,15 +384,19 @@ class NativeStepper(Stepper):
         self._write(
             rows.varying, np.repeat(self.varying.values, len(self.loop.places.offsets), axis=0)
         )
-        self._write_mirror(mirror_values(self.loops, now, x, offsets, bool(self._signals)))
-        memory = np.zeros((len(x), len(rows.memory)))
-        trees = zip((self.leaders, self.followers), now.memory.laws, strict=True)
-        for agents, tree in trees:
-            leaves = [np.asarray(leaf).reshape(len(agents), -1) for leaf in jax.tree.leaves(tree)]
-            flat = np.concatenate([np.zeros((len(agents), 0)), *leaves], axis=1)
-            memory[agents, : flat.shape[1]] = flat
-        self._write(rows.memory, memory)
-        self._hold = -1
+        if not self.plan.listens_first:
+            shown = bool(shown_size(self.loop))
+            self._write_mirror(mirror_values(self.loops, now, x, offsets, shown))
+        memory = now.memory
+        self._write(rows.memory, self._rows_of(memory.laws, memory.sensing, memory.plant))
+        if self.mail is not None:
+            self._write(rows.packet, self.mail.load(int(now.step), memory.network))
+        if len(rows.agent):
+            leaves = [
+                np.concatenate(part) for part in zip(*map(agent_rows, self.loops), strict=True)
+            ]
+            flat = [leaf.reshape(len(x), -1) for leaf in leaves[1:]]
+            self._write(rows.agent, np.concatenate(flat, axis=1))
 
     def _write_mirror(self, values: Array) -> None:
         if self.plan.row_major:
@@ -368,9 +420,11 @@ class NativeStepper(Stepper):
             self._read(part, self.buffers.empty((len(self.places.position), len(part)), kind))
             for part, kind in (*parts, (sums, np.float64))
         )
-        pairs = zip(self.memories, (self.leaders, self.followers), strict=True)
-        laws = LawMemories(*(unflatten(like, memory[agents]) for like, agents in pairs))
-        now = self._moment_of(step, x, laws, cut.astype(np.int8))
+        whole = self._memory(memory)
+        if self.mail is not None:
+            packets = self._read(rows.packet, np.empty((len(x), len(rows.packet)), self.dtype))
+            whole = whole._replace(network=self.mail.memory(step, packets))
+        now = self._moment_of(step, x, whole, cut.astype(np.int8))
         return now, self._sums(first, step, agent_sums)
 
     def _find_inexact(self) -> None:
@@ -479,22 +533,20 @@ def mirror_values(
     return np.concatenate([relative, np.concatenate(sent)], axis=1)
 
 
-_AHEAD, _AT_ONCE = 64, 50_000
-"""Holding intervals that are drawn in a call, and the most draws; a call takes 0.5 ms."""
+@cached_jit
+def begin_many(loop: Loop, states: Float[jax.Array, "F N n"]) -> LoopState:
+    """Return the moments at which runs begin in one loop."""
+    return jax.vmap(begin, (None, 0))(loop, states)
 
 
-@jax.jit
-def _drawn(
-    winds: Sequence[Wind], steps: jax.Array, agents: jax.Array
-) -> tuple[jax.Array, jax.Array | None]:
-    """Return what each wind adds to the rates (T, F, N, n) and noise to the inputs at T steps."""
-    many = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *winds)
-
-    def draws(wind: Wind, step: jax.Array, agent: jax.Array) -> tuple[jax.Array, jax.Array | None]:
-        return wind.on_state(step, agent), wind.on_input(step, agent)
-
-    one = jax.vmap(draws, (None, None, 0))
-    return jax.vmap(jax.vmap(one, (0, None, None)), (None, 0, None))(many, steps, agents)
+def _unflatten(like: Any, flat: Array) -> Any:
+    """Return a tree of leaves (1, ...) with rows of numbers (N, k) in them."""
+    leaves, tree = jax.tree.flatten(like)
+    ends = np.cumsum([0, *(leaf.size for leaf in leaves)]).tolist()
+    parts = zip(leaves, ends[:-1], ends[1:], strict=True)
+    return tree.unflatten(
+        [flat[:, a:b].reshape((len(flat), *leaf.shape[1:])) for leaf, a, b in parts]
+    )
 
 
 _MOST, _LARGE = 16, 2**20

@@ -138,7 +138,8 @@ class ThreadPool:
                 tasks = tile_by_tile(segments, reach, steps, thread, self.threads)
             else:
                 edges = self.places.edge_blocks
-                tasks = step_by_step(segments, edges, steps, thread, self.threads)
+                prior = self.places.listens_first
+                tasks = step_by_step(segments, edges, steps, thread, self.threads, prior)
             self._schedules[steps, thread] = tasks
         return self._schedules[steps, thread]
 
@@ -181,7 +182,9 @@ _DEEP = 4
 """Steps of a tile from which on it uses the smaller of the two caches."""
 
 
-def step_by_step(segments: Array, edges: int, steps: int, thread: int, threads: int) -> Array:
+def step_by_step(
+    segments: Array, edges: int, steps: int, thread: int, threads: int, prior: bool = False
+) -> Array:
     """Return the tasks (T, 8) of a thread that takes its part of each level at each step.
 
     Args:
@@ -190,12 +193,15 @@ def step_by_step(segments: Array, edges: int, steps: int, thread: int, threads: 
         steps: the number of steps.
         thread: the index of the thread.
         threads: the number of threads; they wait for each other after each level.
+        prior: whether all blocks first do what is before any agent acts.
     """
-    sizes, levels = np.diff(segments), len(segments) - 1
-    by_level = np.zeros((steps, levels, len(TASK)), np.int64)
-    by_level[..., 0], by_level[..., 1] = np.arange(steps)[:, None], np.arange(levels)
+    ends = np.stack([segments[:-1], segments[1:]])
+    ends = np.insert(ends, 0, (0, segments[-1]), axis=1) if prior else ends
+    levels = np.arange(ends.shape[1]) - prior
+    by_level = np.zeros((steps, len(levels), len(TASK)), np.int64)
+    by_level[..., 0], by_level[..., 1] = np.arange(steps)[:, None], levels
     for k in (0, 1):
-        by_level[..., 2 + k] = segments[:-1] + sizes * (thread + k) // threads
+        by_level[..., 2 + k] = ends[0] + (ends[1] - ends[0]) * (thread + k) // threads
         by_level[:, -1, 4 + k] = edges * (thread + k) // threads
     tasks = by_level.reshape(-1, len(TASK))
     tasks[:, 6:] = np.arange(len(tasks))[:, None]

@@ -21,15 +21,15 @@ from echelon.simulation.step.settings import Settings
 
 
 def _separate_parts(loop: Loop) -> list[PyTree]:
-    """Return the parts of a loop that have their own rows or draws."""
-    return [loop.places, loop.meter.offsets, loop.meter.spacings, loop.motion.weather]
+    """Return the parts of a loop that have their own rows."""
+    return [loop.places, loop.meter.offsets, loop.meter.spacings, loop.motion.rows]
 
 
 def bare(loop: Loop) -> Loop:
-    """Return a loop without the parts that have their own rows or draws."""
+    """Return a loop without the parts that have their own rows."""
     # Not by `tree_at`, which walks the whole loop several times.
     meter = dataclasses.replace(loop.meter, offsets=None, spacings=None)
-    motion = dataclasses.replace(loop.motion, weather=())
+    motion = dataclasses.replace(loop.motion, rows=())
     return dataclasses.replace(loop, places=None, meter=meter, motion=motion)
 
 
@@ -40,9 +40,16 @@ def is_number(leaf: object) -> bool:
     )
 
 
+def is_key(leaf: object) -> bool:
+    """Tell whether a leaf of a loop is a key of random draws, whose bits have no sign."""
+    return isinstance(leaf, np.ndarray | jax.Array) and np.issubdtype(
+        leaf.dtype, np.unsignedinteger
+    )
+
+
 @final
 class VaryingNumbers:
-    """Numbers of loops that differ only in them.
+    """Numbers of loops that differ only in them, and in the keys of their draws.
 
     Args:
         loops: of the formations, equal in their trees and in all leaves that are not numbers.
@@ -64,7 +71,8 @@ class VaryingNumbers:
         flat = [self._flat, *(jax.tree.leaves(bare(loop)) for loop in others)]
         self._masks = [_differing(leaves) for leaves in zip(*flat, strict=True)]
         # Now: somebody may write to an array later, and code is generated from its present numbers.
-        constant = self._tree.unflatten(self._constant(self._flat))
+        plain = [0 if is_key(leaf) else leaf for leaf in self._constant(self._flat)]
+        constant = self._tree.unflatten(plain)
         self.signature = digest((constant, self._masks))
         values = np.stack([self._values(leaves) for leaves in flat[: len(distinct)]])
         self.values = values[[places[id(loop)] for loop in loops]]
@@ -113,12 +121,22 @@ class VaryingNumbers:
             at += int(mask.sum())
         return leaves
 
-    def filled(self, leaves: Sequence[object]) -> Loop:
-        """Return the loop with these leaves in place of those in which numbers differ."""
-        if not leaves:
+    def keys_of(self, loop: Loop) -> list[Array]:
+        """Return the keys of the draws of a loop."""
+        return [np.asarray(leaf) for leaf in jax.tree.leaves(bare(loop)) if is_key(leaf)]
+
+    def filled(self, leaves: Sequence[object], keys: Sequence[object]) -> Loop:
+        """Return the loop with these leaves in place of those in which numbers differ, and keys."""
+        if not leaves and not keys:
             return self.loop
-        new_leaves, pairs = iter(leaves), zip(self._flat, self._masks, strict=True)
-        new = self._tree.unflatten([next(new_leaves) if m.any() else leaf for leaf, m in pairs])
+        new_leaves, new_keys = iter(leaves), iter(keys)
+        pairs = zip(self._flat, self._masks, strict=True)
+        new = self._tree.unflatten(
+            [
+                next(new_keys) if is_key(leaf) else next(new_leaves) if m.any() else leaf
+                for leaf, m in pairs
+            ]
+        )
         # None is an empty tree to JAX, and could not be replaced without `is_leaf`.
         return eqx.tree_at(
             _separate_parts,
@@ -150,14 +168,13 @@ class ProgramKeys:
     def of(self, loop: Loop, settings: Settings) -> Hashable:
         """Return what is equal for all loops that one program can step.
 
-        It has the tree, all leaves that are not numbers, the times of the draws, and the numbers
-        that a reference, an initial memory, the weights or the difference of two states depend on.
+        It has the tree, all leaves that are neither numbers nor keys, and the numbers that a
+        reference, an initial memory, the weights or the difference of two states depend on.
         """
         leaves, tree = jax.tree.flatten(bare(loop))
-        weather = loop.motion.weather
-        draws = jax.tree.structure(weather), [int(part.window) for part in weather]
-        shapes = [np.shape(leaf) if is_number(leaf) else leaf for leaf in leaves]
-        kind = process_key((tree.unflatten(shapes), draws, settings))
+        shapes = [np.shape(x) if is_number(x) or is_key(x) else x for x in leaves]
+        rows = jax.tree.map(np.shape, loop.motion.rows)
+        kind = process_key((tree.unflatten(shapes), rows, settings))
         pairs = zip(
             leaves, self._fixed.get_or_make(kind, lambda: _fixed(leaves, tree)), strict=True
         )

@@ -20,6 +20,7 @@ from echelon.core.numerics import Precision, precision
 from echelon.core.trace import error_summary
 from echelon.core.types import PyTree
 from echelon.simulation.scalars import elementary
+from echelon.simulation.scalars.host_part import HostPart
 from echelon.simulation.scalars.scalar_graph import Entry, Node, ScalarGraph, needed, within
 from echelon.simulation.scalars.traced_entries import (
     LARGEST,
@@ -54,24 +55,48 @@ from echelon_ranges.jaxpr import (
 
 
 def lower(
-    function: Callable[..., PyTree], graph: ScalarGraph, arguments: Sequence[PyTree]
+    function: Callable[..., PyTree],
+    graph: ScalarGraph,
+    arguments: Sequence[PyTree],
+    known: Sequence[PyTree] = (),
+    ahead: HostPart | None = None,
 ) -> Arrays:
-    """Return results of a JAX function, flattened, as nodes and numbers; or raise `Unsupported`."""
+    """Return results of a JAX function, flattened, as nodes and numbers; or raise `Unsupported`.
+
+    Args:
+        function: of the arguments; of what the host knows first, if it knows any.
+        graph: of the nodes.
+        arguments: arrays of nodes or numbers.
+        known: arrays that the host knows.
+        ahead: takes what depends on these, and on the step at most.
+    """
     leaves, tree = jax.tree.flatten(list(arguments), is_leaf=lambda a: isinstance(a, np.ndarray))
+    first, before = jax.tree.flatten(list(known))
     # In the precision of the run: a user's function may ask for it (`x.dtype`).
     name: Precision = "float64" if graph.bits == 64 else "float32"
     shaped = [_shape(leaf, np.dtype(name)) for leaf in leaves]
 
     def flat(*entries: jax.Array) -> list[jax.Array]:
-        return jax.tree.leaves(function(*jax.tree.unflatten(tree, entries)))
+        own = jax.tree.unflatten(before, entries[: len(first)])
+        return jax.tree.leaves(function(*own, *jax.tree.unflatten(tree, entries[len(first) :])))
 
     with precision(name):
-        closed = jax.make_jaxpr(flat)(*shaped)
+        closed = jax.make_jaxpr(flat)(*first, *shaped)
+        jaxpr = closed.jaxpr
+        if ahead is not None:
+            step = len(first) + next(k for k, leaf in enumerate(leaves) if _is_step(leaf))
+            jaxpr, taken = ahead.split(closed, len(first), step, graph)
+            leaves = [*taken, *leaves]
         try:
-            return walk(closed.jaxpr, closed.consts, leaves, _algebra(graph))
+            return walk(jaxpr, closed.consts, leaves, _algebra(graph))
         except (TypeError, ValueError, IndexError, KeyError, AttributeError) as error:
             # Users write what is traced: an unforeseen trace must not end a run that JAX can do.
             raise Unsupported(f"a trace that no rule fits ({error_summary(error)})") from error
+
+
+def _is_step(leaf: np.ndarray) -> bool:
+    one: Any = leaf[()] if leaf.shape == () else None
+    return isinstance(one, Node) and one.value == ("step",)
 
 
 def _shape(leaf: np.ndarray, real: np.dtype) -> jax.ShapeDtypeStruct:

@@ -5,7 +5,7 @@ clock counts seconds.
 """
 
 import dataclasses
-from typing import NamedTuple, final
+from typing import Any, NamedTuple, final
 
 import equinox as eqx
 import jax
@@ -216,18 +216,38 @@ class OnlyFollows(Turns):
 # ---- the loop ------------------------------------------------------------------------------------
 
 
+def one_row(
+    loop: Loop, leads: bool, number: Array | jax.Array, rows: PyTree, **members: Any
+) -> Loop:
+    """Return the loop of one agent, which leads or follows, of a `number` (1,).
+
+    Args:
+        loop: of its formation.
+        leads: whether it is a leader.
+        number: of the agent.
+        rows: of its plant, as `PlantStep.rows`.
+        members: its own, in place of those of the formation.
+    """
+    first, none = np.array([0]), np.array([], int)
+    groups = (first, none) if leads else (none, first)
+    laws = dataclasses.replace(
+        loop.laws, leaders=groups[0], followers=groups[1], order=first, numbers=number
+    )
+    motion = dataclasses.replace(loop.motion, rows=rows)
+    turn = OnlyLeads() if leads else OnlyFollows()
+    if loop.laws.backups and leads:
+        turn = BackupsToo(Relay())
+    own = {"laws": laws, "motion": motion, "roster": Everybody(), "turns": turn}
+    return loop.replace(**own, **members)
+
+
 def alone(loop: Loop, number: int, arrived: Arrived, schedule: Schedule | None) -> Loop:
     """Return the loop of one agent of a formation: one row of each member.
 
     `schedule` is that of a graph that switches.
     """
     own, laws = slice(number, number + 1), loop.laws
-    first, none = np.array([0]), np.array([], int)
     leads = number in np.asarray(laws.leaders)
-    groups = (first, none) if leads else (none, first)
-    laws = dataclasses.replace(
-        laws, leaders=groups[0], followers=groups[1], order=first, numbers=laws.numbers[own]
-    )
     exchange, network = loop.graph.exchange, loop.network
     mine = np.asarray(exchange.receivers) == number
     senders, weights = np.arange(mine.sum()), np.asarray(exchange.weights)[..., mine]
@@ -247,19 +267,16 @@ def alone(loop: Loop, number: int, arrived: Arrived, schedule: Schedule | None) 
     if isinstance(near, ExactHulls):
         others = np.delete(np.arange(loop.agents), number)
         near = ReceivedHulls(near, others, np.isin(others, loop.laws.leaders), arrived)
-    leader = BackupsToo(Relay()) if laws.backups else OnlyLeads()
-    turns = leader if leads else OnlyFollows()
-    rows = jax.tree.map(lambda leaf: leaf[own], loop.motion.rows)
-    return loop.replace(
-        laws=laws,
+    return one_row(
+        loop,
+        leads,
+        laws.numbers[own],
+        jax.tree.map(lambda leaf: leaf[own], loop.motion.rows),
         sensing=loop.sensing.on_board,
         places=loop.places.of_one(number),
         graph=graph,
         network=network,
         surroundings=near,
-        turns=turns,
-        motion=dataclasses.replace(loop.motion, rows=rows),
-        roster=Everybody(),
     )
 
 

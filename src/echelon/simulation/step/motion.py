@@ -194,12 +194,6 @@ class PlantStep(eqx.Module):
             rows,
         )
 
-    @property
-    def ideal(self) -> bool:
-        """Whether inputs act at once, on agents that are alike, with independent draws of wind."""
-        windy = any(part.remembers or part.moves for part in self.weather)
-        return self.motors.at_once and self.rows == () and self.substeps == 1 and not windy
-
     def of_row(self, row: PyTree) -> "PlantStep":
         """Return the motion of one agent, of which `row` has the parameters of its own."""
         if row == ():

@@ -381,13 +381,20 @@ class MessageRules(eqx.Module):
         leader = jnp.where((itself | ~aware)[:, None], known.said, leader)
         forward = jnp.where(aware[:, None], forward, 0.0)
         hops, knows = self.hops(mail, age, leads, links, clock.dt), leads | aware
-        received, used, fresh = self.content.received(mail, age, leader, knows, known)
-        received = jnp.where(used[:, None], received, known.said[jnp.asarray(links.receivers)])
-        fresh = fresh & used & self.neighbours.uses(mail, hops, links)
+        received, fresh = self.received(mail, age, leader, knows, known)
+        fresh = fresh & self.neighbours.uses(mail, hops, links)
         off = loop.laws.speech.difference(loop.model)(known.said, leader)
         alone = jnp.where(knows[:, None], off, 0.0)
         z = self.neighbours.disagreement(known, received, fresh, alone, loop)
         return NetworkEstimate(z, leads, forward, leader, hops, packet)
+
+    def received(
+        self, mail: Messages, age: jax.Array, leader: jax.Array, knows: jax.Array, known: Known
+    ) -> tuple[Float[jax.Array, "K s"], Bool[jax.Array, " K"]]:
+        """Return the signal of the sender of each link, the own one of none, and which is fresh."""
+        received, used, fresh = self.content.received(mail, age, leader, knows, known)
+        own = known.said[jnp.asarray(known.links.receivers)]
+        return jnp.where(used[:, None], received, own), fresh & used
 
     def hops(
         self,
@@ -496,12 +503,32 @@ class LateNetwork(IdealNetwork):
         here: Mask,
     ) -> Messages:
         """Return the mail with what arrives now, and with who takes the lead."""
-        arrival = self.medium.arrivals(in_flight, clock.step, mail.stamp)
-        places = arrival.slot, jnp.asarray(links.senders)
-        sent: Messages = jax.tree.map(lambda rows: rows[places], in_flight.content)
-        mail = self.rules.take(mail, sent, arrival.new, arrival.stamp, links)
+        arriving = self.arriving(in_flight, clock.step, mail, links)
+        return self.taken(mail, arriving, number, clock, since, links, here)
+
+    def taken(
+        self,
+        mail: Messages,
+        arriving: tuple[Messages, jax.Array, jax.Array],
+        number: jax.Array,
+        clock: Clock,
+        since: jax.Array,
+        links: Exchange,
+        here: Mask,
+    ) -> Messages:
+        """Return the mail with what is arriving, and with who takes the lead."""
+        mail = self.rules.take(mail, *arriving, links)
         packet = self.leadership.elect(mail.packet, number, clock, since, here)
         return mail._replace(packet=packet)
+
+    def arriving(
+        self, in_flight: PyTree, step: jax.Array, mail: Messages, links: Exchange
+    ) -> tuple[Messages, jax.Array, jax.Array]:
+        """Return a message of each link (K, ...), which of them arrives now, and its stamp."""
+        arrival = self.medium.arrivals(in_flight, step, mail.stamp)
+        places = arrival.slot, jnp.asarray(links.senders)
+        sent: Messages = jax.tree.map(lambda rows: rows[places], in_flight.content)
+        return sent, arrival.new, arrival.stamp
 
     def send(self, loop: Loop, memory: PyTree, known: Known, speech: LeaderSpeech) -> PyTree:
         """Return the network after what agents send now."""

@@ -66,10 +66,10 @@ def _with_members_of(part: WorldPart, loop: Loop, problem: Problem) -> Loop:
     return changed
 
 
-def own_members(loop: Loop) -> str:
-    """Return the class of a member that is not echelon's; empty without any."""
-    names = (field.name for field in dataclasses.fields(loop) if field.name not in _LAWS)
-    found = (kind.__name__ for name in names for kind in own_classes(getattr(loop, name)))
+def own_members(loop: Loop, but: frozenset[str] = frozenset()) -> str:
+    """Return the class of a member that is not echelon's, `but` for some; empty without any."""
+    names = {field.name for field in dataclasses.fields(loop)} - _LAWS - but
+    found = (kind.__name__ for name in sorted(names) for kind in own_classes(getattr(loop, name)))
     return next(found, "")
 
 

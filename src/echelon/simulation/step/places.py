@@ -12,7 +12,7 @@ from jaxtyping import Float
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.formation_motion import FormationMotion, OwnOffset
-from echelon.core.types import Array, Scalar
+from echelon.core.types import Array, PyTree, Scalar
 from echelon.laws.law import Law, Speaks
 from echelon.simulation.step.records import GroupOffsets
 from echelon.simulation.step.run_laws import RunLaws
@@ -36,9 +36,18 @@ class FixedPlaces(eqx.Module):
         offsets, motion = np.asarray(formation.offsets), formation.motion
         return FixedPlaces(offsets) if motion is None else MovingPlaces(offsets, motion)
 
+    @property
+    def rows(self) -> PyTree:
+        """What differs between agents, with a row of each; the offsets come first."""
+        return (self.offsets,)
+
+    def of_rows(self, rows: PyTree) -> "FixedPlaces":
+        """Return the places of agents with these rows."""
+        return FixedPlaces(*rows)
+
     def of_one(self, number: int) -> "FixedPlaces":
         """Return the places of one agent alone."""
-        return FixedPlaces(self.offsets[number : number + 1])
+        return self.of_rows(tuple(leaf[number : number + 1] for leaf in self.rows))
 
     def of_group(self, model: ControlAffine, law: Law, t: Scalar, agents: Agents) -> GroupOffsets:
         """Return what agents under a law take for their offsets at a time (s)."""
@@ -68,10 +77,15 @@ class MovingPlaces(FixedPlaces):
 
     motion: FormationMotion
 
-    def of_one(self, number: int) -> FixedPlaces:
-        """Return the places of one agent alone."""
-        motion = dataclasses.replace(self.motion, places=self.motion.places[number : number + 1])
-        return MovingPlaces(self.offsets[number : number + 1], motion)
+    @property
+    def rows(self) -> PyTree:
+        """What differs between agents: offsets, and places in the shapes."""
+        return self.offsets, self.motion.places
+
+    def of_rows(self, rows: PyTree) -> FixedPlaces:
+        """Return the places of agents with these rows."""
+        offsets, places = rows
+        return MovingPlaces(offsets, dataclasses.replace(self.motion, places=places))
 
     def of_group(self, model: ControlAffine, law: Law, t: Scalar, agents: Agents) -> GroupOffsets:
         """Return what the law makes of them."""

@@ -66,7 +66,7 @@ class Steps(NamedTuple):
         """Whether this is the first step."""
         return self.step == 0
 
-    def age(self, stamp: Int[jax.Array, " K"]) -> Float[jax.Array, " K"]:
+    def age(self, stamp: jax.Array) -> Float[jax.Array, " *K"]:
         """Return the age (s) of what has this stamp; infinite where nothing came."""
         return jnp.where(stamp == NEVER, jnp.inf, (self.step - stamp) * jnp.asarray(self.dt))
 

@@ -59,10 +59,11 @@ def begin_forgetful(loop: Loop, states: Any) -> LoopState:
 @cached_jit
 def said_by(loop: Loop, now: LoopState) -> Float[jax.Array, "N s"]:
     """Return what all agents say who know their states exactly (N, s)."""
-    return _said(loop, now.states, now.memory.laws, Steps(now.step, loop.motion.dt))[1]
+    return saying(loop, now.states, now.memory.laws, Steps(now.step, loop.motion.dt))[1]
 
 
-def _said(loop: Loop, x: States, laws: LawMemories, clock: Clock) -> tuple[Any, jax.Array]:
+def saying(loop: Loop, x: States, laws: LawMemories, clock: Clock) -> tuple[Any, jax.Array]:
+    """Return the offsets of both groups at states x, and what all say (N, s)."""
     offsets = loop.places.groups(loop.model, loop.laws, clock.t)
     everywhere = loop.places.of_all(loop.laws, offsets)
     known = Sayings(loop.model, x, everywhere, offsets, laws)
@@ -81,7 +82,7 @@ def hear(loop: Loop, now: LoopState, clock: Clock) -> tuple[Known, PyTree, PyTre
     x, sensing = jax.vmap(sense)(memory.sensing, now.states, numbers)
     own = Own(numbers, x)
     # 2. Say.
-    offsets, said = _said(loop, x, memory.laws, clock)
+    offsets, said = saying(loop, x, memory.laws, clock)
     # 3. Hear.
     known = Known(clock, here, own, offsets, said, loop.graph.at(clock.step))
     heard, network = loop.network.receive(loop, memory.network, known)
@@ -90,31 +91,30 @@ def hear(loop: Loop, now: LoopState, clock: Clock) -> tuple[Known, PyTree, PyTre
 
 def control(loop: Loop, now: LoopState, clock: Clock) -> Control:
     """Return what all agents do from a moment on."""
-    memory = now.memory
-    known, sensing, network = hear(loop, now, clock)
-    here = known.here
+    return act(loop, now, *hear(loop, now, clock))
+
+
+def act(loop: Loop, now: LoopState, known: Known, sensing: PyTree, network: PyTree) -> Control:
+    """Return what all agents do with what they know; the memories are those after hearing it."""
+    memory, here = now.memory, known.here
     # 4. Look around.
     near, seen = loop.surroundings.look(loop, memory.near, memory.laws, known)
-    # 5. Act.
     known = known._replace(near=near)
+    # 5. Act.
     led, followed, speech, network = loop.turns.play(loop, known, memory.laws, network)
     # 6. Write.
     network = loop.network.send(loop, network, known, speech)
     # 7. Deliver: what limits leave is what acts.
-    u = loop.laws.ordered(led.input, followed.input)
-    u = choose(here, u, jnp.zeros_like(u))
+    inputs = loop.laws.ordered(led.input, followed.input)
+    u = choose(here, inputs, jnp.zeros_like(inputs))
     desired = loop.laws.ordered(led.desired, followed.desired)
     limited, cut = limit_sides(loop.model, u, desired)
     limited, cut = choose(here, (limited, cut), jax.tree.map(jnp.zeros_like, (limited, cut)))
-    memory = memory._replace(
-        laws=LawMemories(led.memory, followed.memory),
-        sensing=jax.vmap(loop.sensing.acted)(sensing, u),
-        network=network,
-        near=seen,
-    )
+    laws = LawMemories(led.memory, followed.memory)
+    sensing = jax.vmap(loop.sensing.acted)(sensing, u)
+    memory = memory._replace(laws=laws, sensing=sensing, network=network, near=seen)
     message = loop.laws.ordered(led.message, followed.message)
-    cuts = limited.any(axis=1), cut.astype(jnp.int8)
-    return Control(u, *cuts, memory, known.said, message)
+    return Control(u, limited.any(axis=1), cut, memory, known.said, message)
 
 
 def _held(loop: Loop, mask: Mask, one: LoopState, other: LoopState) -> LoopState:
@@ -148,7 +148,8 @@ def _moved(loop: Loop, now: LoopState, acted: Control) -> LoopState:
     """Return the moment one dt later; who is absent stays as it is."""
     rows = now.states, acted.inputs, now.step, jnp.asarray(loop.laws.numbers)
     states, plant = loop.motion.advance(now.memory.plant, *rows)
-    after = LoopState(now.step + 1, states, acted.cut, acted.memory._replace(plant=plant))
+    cut = acted.cut.astype(jnp.int8)
+    after = LoopState(now.step + 1, states, cut, acted.memory._replace(plant=plant))
     before = now.memory
     memory = after.memory._replace(laws=before.laws, sensing=before.sensing, plant=before.plant)
     absent = now._replace(step=after.step, memory=memory)
