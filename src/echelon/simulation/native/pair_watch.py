@@ -79,16 +79,17 @@ class PairWatch:
     def _compare(self) -> None:
         """Find the closest pairs of those that the kernel kept."""
         squares, steps = self.least.transpose(2, 0, 3, 1).reshape(2, -1, len(self.pairs[0]))
-        squares, formations = squares[: self.formations].astype(float), np.arange(self.formations)
-        pair = squares.argmin(axis=1)
-        step = steps[formations, pair] - self.first
-        self._keep(formations, np.sqrt(squares[formations, pair]), step, pair)
+        squares, steps = squares[: self.formations], steps[: self.formations]
+        order = np.where(squares == squares.min(axis=1, keepdims=True), steps, np.inf)
+        formations, pair = np.arange(self.formations), order.argmin(axis=1)
+        step = steps[formations, pair].astype(int) - self.first
+        self._keep(formations, squares[formations, pair], step, pair)
 
     def _places(self) -> Float[np.ndarray, "d S K F N"]:
         """Return the recorded positions in K spans of S steps; the last step fills its span."""
         rows = np.minimum(np.arange(-(-self.used // _SPAN) * _SPAN), self.used - 1)
         # Axis by axis: (T, blocks, d, lanes) -> (d, T, positions).
-        by_axis = np.ascontiguousarray(self.tape[rows].transpose(2, 0, 1, 3), float)
+        by_axis = np.ascontiguousarray(self.tape[rows].transpose(2, 0, 1, 3))
         places = by_axis.reshape(len(by_axis), len(rows), -1)[..., self.position]
         agents = len(self.position) // self.formations
         spans = places.reshape(len(by_axis), -1, _SPAN, self.formations, agents)
@@ -108,16 +109,17 @@ class PairWatch:
     def _search_all(self) -> None:
         (i, j), count = self.pairs, self.formations
         axes = self.tape[: self.used].transpose(2, 0, 1, 3).reshape(self.tape.shape[2], -1)
-        places = axes.reshape(len(axes), self.used, -1)[..., self.position].astype(float)
+        places = axes.reshape(len(axes), self.used, -1)[..., self.position]
         places = places.reshape(*places.shape[:2], count, -1)
-        squares = ((places[..., i] - places[..., j]) ** 2).sum(axis=0).swapaxes(0, 1)
+        squares = _squares(places[..., i] - places[..., j]).swapaxes(0, 1)
         squares = squares.reshape(count, -1)
         squares[np.isnan(squares)] = np.inf
         best = squares.argmin(axis=1)
         step, pair = np.divmod(best, len(i))
-        self._keep(np.arange(count), np.sqrt(squares[np.arange(count), best]), step, pair)
+        self._keep(np.arange(count), squares[np.arange(count), best], step, pair)
 
-    def _keep(self, f: Array, least: Array, step: Array, pair: Array) -> None:
+    def _keep(self, f: Array, squares: Array, step: Array, pair: Array) -> None:
+        least = np.sqrt(squares.astype(float))
         new, (i, j) = least < self.closest[f], self.pairs
         self.closest[f[new]] = least[new]
         rows = self.first + step[new], i[pair[new]], j[pair[new]]
@@ -127,14 +129,15 @@ class PairWatch:
         """Compare the pairs that may be closer than the closest, span by span."""
         i, j = self.pairs
         # What all agents do together changes no distance.
-        places = places - places.mean(axis=-1, keepdims=True)
-        start = places[:, 0]
-        moved = np.sqrt(((places - start[:, None]) ** 2).sum(axis=0).max(axis=0))
+        moving = places - places.mean(axis=-1, keepdims=True, dtype=float)
+        start = moving[:, 0]
+        moved = np.sqrt(((moving - start[:, None]) ** 2).sum(axis=0).max(axis=0))
         gaps = np.sqrt(((start[..., i] - start[..., j]) ** 2).sum(axis=0))
         gaps[np.isnan(gaps)] = np.inf
         # Two agents that move by so much within a span come no closer than their gap less that.
-        bound = (1.0 - _TIE) * np.minimum(self.closest, gaps.min(axis=(0, 2)))
-        searched = gaps - moved[..., i] - moved[..., j] < bound[:, None]
+        tie = max(_TIE, 16.0 * np.finfo(places.dtype).eps)
+        bound = (1.0 - tie) * np.minimum(self.closest, gaps.min(axis=(0, 2)))
+        searched = (1.0 - tie) * gaps - moved[..., i] - moved[..., j] < bound[:, None]
         nearest = gaps.swapaxes(0, 1).reshape(self.formations, -1).argmin(axis=1)
         searched[nearest // len(i), np.arange(self.formations), nearest % len(i)] = True
         self._search_some(places, *np.nonzero(searched))
@@ -144,10 +147,14 @@ class PairWatch:
     ) -> None:
         """Compare pairs p of formations f in spans k."""
         i, j = self.pairs
-        apart = places[:, :, k, f, i[p]] - places[:, :, k, f, j[p]]
-        distances = np.sqrt((apart**2).sum(axis=0))
-        distances[np.isnan(distances)] = np.inf
-        least, s = distances.min(axis=0), distances.argmin(axis=0)
-        order = np.lexsort((k, least, f))
+        squares = _squares(places[:, :, k, f, i[p]] - places[:, :, k, f, j[p]])
+        squares[np.isnan(squares)] = np.inf
+        least, step = squares.min(axis=0), _SPAN * k + squares.argmin(axis=0)
+        order = np.lexsort((p, step, least, f))
         best = order[np.unique(f[order], return_index=True)[1]]
-        self._keep(f[best], least[best], _SPAN * k[best] + s[best], p[best])
+        self._keep(f[best], least[best], step[best], p[best])
+
+
+def _squares(apart: Float[np.ndarray, "d ..."]) -> Array:
+    """Return squared lengths, added up axis by axis in the same precision as in a kernel."""
+    return sum((axis * axis for axis in apart[1:]), apart[0] * apart[0])
