@@ -1,7 +1,7 @@
 """Measure collision avoidance under the law `stopping-point`: formations that cross each other.
 
 Run `python benchmarks/crossings.py` (some 20 minutes on two cores; `--share 0.1` is quicker). All
-flights of a kind are one compiled program. The figures stand on the theory page, under T10.
+flights of a kind are one compiled program. The figures stand in docs/theory/separation.md.
 """
 
 import argparse

@@ -1,7 +1,7 @@
 """Count which starts converge when a parent's input is fed forward instead of the leader's.
 
 Run `python benchmarks/parents.py` (about ten minutes on two cores); `--seeds 4` is quicker. The
-table stands on the theory page, under T4.
+table stands in docs/theory/consensus.md, under T4.
 """
 
 import argparse

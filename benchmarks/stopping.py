@@ -2,7 +2,7 @@
 
 Run `python benchmarks/stopping.py` (some minutes; `--starts 100` is quicker). It counts how many of
 the paper's starts lie inside the certificate with motors, flies them, and flies those of a few in
-wind, with a false mass and in gusts. The tables stand on the theory page, under T5.
+wind, with a false mass and in gusts. The tables stand in docs/theory/stopping_points.md.
 """
 
 import argparse

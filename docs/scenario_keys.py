@@ -14,13 +14,11 @@ from echelon.experiments.scenario.scenario import json_schema
 
 _HEAD = """# Scenario keys
 
-All keys of a scenario file; a first one is in the [first quarter of an hour](start.md), and words
-such as *trim* and *gain* in the [glossary](glossary.md). A *section* is a mapping with the keys of
-its table below; a key without a default may be left out. *By state or group* means a mapping from
-names of the model, such as `{x: 1.0}` or `{position: 1.0}` for all its coordinates. Numbers are in
-SI units and angles in rad; *1* marks a number without a unit. `python: file.py:Class` names a class
-of [yours](extending.md). `docs/scenario_keys.py` writes the page from the schema that checks the
-file.
+All keys of a scenario file ([a first one](start.md)). A *section* is a mapping with the keys of its
+table below; a key without a default may be left out. *By state or group* means a mapping from names
+of the model, such as `{x: 1.0}` or `{position: 1.0}` for all its coordinates. Numbers are in SI
+units and angles in rad; *1* marks a number without a unit. `python: file.py:Class` names a class of
+[yours](extending.md). `docs/scenario_keys.py` writes the page.
 """
 Schema: TypeAlias = Mapping[str, Any]
 """A part of a JSON schema."""

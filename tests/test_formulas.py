@@ -72,9 +72,10 @@ def test_a_marked_page_has_formulas_frames_and_folded_tests():
     assert rendered(plain) == markdown.markdown(plain, extensions=["tables"])
 
 
-def test_braces_of_all_formulas_of_the_theory_page_match():
-    html = rendered((DOCS / "theory.md").read_text("utf-8"))
+def test_braces_of_all_formulas_of_the_theory_pages_match():
+    pages = (DOCS / "theory").glob("*.md")
+    html = "".join(rendered(path.read_text("utf-8")) for path in pages)
     parts = re.findall(r'class="formula">\\[(\[](.*?)\\[)\]]</', html, re.DOTALL)
-    assert len(parts) > 300
+    assert len(parts) > 500
     for part in parts:
         assert part.count("{") == part.count("}") and "class=" not in part, part
