@@ -313,7 +313,7 @@ def test_a_graph_that_switches_is_live_by_its_schedule(monkeypatch):
     # Few periods are foreseen at a time, so that the loop must look ahead again.
     monkeypatch.setattr(looked, "_AHEAD", 0.2)
     swarm = LiveLoop(*panel.experiment, panel.live)
-    assert len(swarm.loop.switches.steps) == 10 and panel.live.loop(panel.start) is None
+    assert len(swarm.loop.graph.switches.steps) == 10 and panel.live.loop(panel.start) is None
     for knobs in (panel.start, panel.start._replace(cut=frozenset({2}))):
         parts, settings = build(panel.scenario_at(knobs))
         settings = settings._replace(horizon=1.2)

@@ -162,8 +162,8 @@ class LiveLoop:
         self._look_ahead(0)
         self._count(panel.start)
         # Other in all numbers that knobs change, except for weights.
-        other = (np.full(np.shape(leaf), np.nan) for leaf in self._adjustable(self.loop))
-        unlike = eqx.tree_at(self._adjustable, self.loop, tuple(other))
+        other = (np.full(np.shape(leaf), np.nan) for leaf in self._changing(self.loop))
+        unlike = eqx.tree_at(self._changing, self.loop, tuple(other))
         engine = choose_stepper(self.loop, unlike, self.states, settings)
         self.stepper = engine.stepper
         self.precision: Precision = engine.precision
@@ -179,6 +179,13 @@ class LiveLoop:
             return share, follower.coupling
         gain = follower.gain
         return share, gain.coupling, gain.P, gain.R, gain.R_inverse, gain.inner
+
+    def _changing(self, loop: Loop) -> tuple[PyTree, ...]:
+        """Return all numbers that knobs change, except for places and weights."""
+        noisy = (k for k, one in enumerate(self.sensing.stages) if isinstance(one, NoisySensor))
+        noise: Any = (loop.sensing.stages[k] for k in noisy)
+        wind = loop.motion.weather[0].constant
+        return (*self._adjustable(loop), wind, *(stage.std for stage in noise))
 
     def _look_ahead(self, step: int) -> None:
         schedule, dt = self.parts.graph.schedule, self.settings.dt
