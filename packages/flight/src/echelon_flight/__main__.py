@@ -24,8 +24,6 @@ from echelon_flight.mission import Mission
 from echelon_flight.supervisor import Fault
 from echelon_flight.wire import GROUND
 
-_READY = 5.0  # s, within which a state of the vehicle must arrive
-
 
 def main() -> None:
     """Run one process; an error is one sentence and exit code 2."""
@@ -109,7 +107,7 @@ def _fly(mission: Mission, options: argparse.Namespace) -> int:
     try:
         law, facts = mission.law(options.agent)
         socket = DatagramSocket(listen, to, options.interface)
-        link = open_link(options.link, facts)
+        link = open_link(options.link, facts | {"parameters": mission.parameters})
     except FlightError as error:
         if not options.dry_run:
             tell_once(wire.note(time.time(), str(error).rstrip(".")), to, options.interface)
@@ -117,31 +115,32 @@ def _fly(mission: Mission, options: argparse.Namespace) -> int:
     # The start may have been said often while the link was opened.
     socket.skip()
     if options.dry_run:
-        _wait_for_state(link, options.link)
+        _wait_for_state(link, options.link, mission.parameters["state_patience"])
         print(f"agent {options.agent}: all checks passed; nothing was sent to other agents.")
         return 0
     seconds = mission.facts["horizon"] if options.seconds is None else options.seconds
     clock = PlanClock(options.speed)
-    context = AgentContext(law, facts, mission.facts, link, socket, wire, clock)
+    log = mission.log(facts, options.link)
+    context = AgentContext(law, facts, mission.facts, link, socket, wire, clock, log)
     fault = AgentProcess(context, seconds).run()
     return 0 if fault in (Fault.END, Fault.SIGNAL) else 1
 
 
-def _wait_for_state(link: Link, address: str) -> None:
-    """Wait for a state of the vehicle.
+def _wait_for_state(link: Link, address: str, patience: float) -> None:
+    """Wait for a state of the vehicle, some seconds at most.
 
     Raises:
         FlightError: none came.
     """
-    deadline = time.monotonic() + _READY
+    deadline = time.monotonic() + patience
     while time.monotonic() < deadline:
         reading = link.read(0.1)
         if reading is not None and all(map(math.isfinite, reading.x)):
             link.close()
             return
     raise FlightError(
-        f"no state of the vehicle arrived within {_READY:g} s over the link `{address}`; switch it "
-        "on, and check `--link`. To check the flight without vehicles, use `--all --dry-run`."
+        f"no state of the vehicle arrived within {patience:g} s over the link `{address}`; switch "
+        "it on, and check `--link`. To check the flight without vehicles, use `--all --dry-run`."
     )
 
 
@@ -151,7 +150,8 @@ def _watch(mission: Mission, options: argparse.Namespace) -> int:
 
     listen, to = _ways(mission, GROUND, options)
     wire = mission.wire(GROUND, options.key)
-    ground = Ground(DatagramSocket(listen, to, options.interface), wire, mission.agents)
+    socket = DatagramSocket(listen, to, options.interface)
+    ground = Ground(socket, wire, mission.agents, parameters=mission.parameters)
     ground.listen()
     with page_of(ground).serving() as address:
         where = f"the ground station is at {address}"

@@ -7,15 +7,13 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, Self, final
+from typing import Any, Self, final
 
 from echelon_flight import FlightError
 from echelon_flight.datagram_socket import LOOPBACK, DatagramSocket, ports_of
 from echelon_flight.ground import Ground
 from echelon_flight.mission import Mission, make_key
 from echelon_flight.wire import GROUND, Report
-
-_PATIENCE: Final = 20.0  # s until all agents are ready
 
 
 @final
@@ -53,7 +51,7 @@ class LocalFlight:
         self._begins = math.inf
         wire = mission.wire(GROUND, self._key)
         socket = DatagramSocket(self._ports[-1], self._ways(mission.agents))
-        self.ground = Ground(socket, wire, mission.agents, self._note)
+        self.ground = Ground(socket, wire, mission.agents, self._note, mission.parameters)
         self.ground.listen()
 
     def _ways(self, own: int) -> list[tuple[str, int]]:
@@ -78,7 +76,7 @@ class LocalFlight:
             self._begin("bridge", words)
 
     def _wait_until_ready(self) -> None:
-        deadline = time.monotonic() + _PATIENCE
+        deadline = time.monotonic() + (patience := self._mission.parameters["ready_patience"])
         while not (len(self.ready) == self._mission.agents and self.ground.ready):
             ended = [name for name, x in self._running.items() if x.poll() is not None]
             if ended:
@@ -86,7 +84,7 @@ class LocalFlight:
             if time.monotonic() > deadline:
                 missing = sorted({*range(self._mission.agents)} - {*self.ready})
                 raise FlightError(
-                    f"after {_PATIENCE:g} s agent {missing[0] if missing else 0} is not ready."
+                    f"after {patience:g} s agent {missing[0] if missing else 0} is not ready."
                 )
             time.sleep(0.02)
 

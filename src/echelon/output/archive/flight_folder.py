@@ -44,6 +44,7 @@ from echelon.simulation.onboard.source_code import LawFunction, c_text, header_t
 from echelon.simulation.scalars import Unsupported
 from echelon.simulation.step.networks import LateNetwork
 from echelon.simulation.step.settings import Settings
+from echelon_flight.parameters import DEFAULTS
 
 _EXCLUDES = (
     "state estimation, message formats and time-outs, the vehicle's own control loops, and a "
@@ -219,6 +220,7 @@ def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, 
         "weather": {"delay": network.delay, "jitter": network.jitter, "loss": network.loss},
         **_places(parts.model),
         "fence": _fence(parts, settings),
+        "parameters": dict(DEFAULTS),
         "offsets": _offsets(parts, settings),
         "vehicles": vehicles[0],
     }

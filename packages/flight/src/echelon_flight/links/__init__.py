@@ -39,7 +39,8 @@ class Link(abc.ABC):
 
     Args:
         address: the text after `scheme://`; "" if there is none.
-        facts: the content of law.json: `agent`, `dt`, `states` and `inputs` with their units.
+        facts: the content of law.json: `agent`, `dt`, `states` and `inputs` with their units; and
+            `parameters` of the flight.
 
     Attributes:
         inputs: the names of the law's inputs that it can send, in order, such as
