@@ -108,17 +108,21 @@ def _check(
 
 
 def _prepare(scenario: str, changes: list[str], out: Path | None) -> Path:
-    from echelon.experiments.scenario.scenario import load_scenario
+    from echelon.experiments.scenario.scenario import SCENARIO_FILE, load_scenario
 
     loaded = load_scenario(scenario, changes)
     if out is not None:
         check_empty(out)
     STATUS.begin(f"writing the laws of {loaded.name}")
-    from echelon.experiments.scenario.build import build
+    from echelon.experiments.scenario.build import build, origin_of
     from echelon.experiments.scenario.self_contained import content_of_files
     from echelon.output.archive.flight_folder import flight_files, save_flight
+    from echelon.output.archive.flown import PLAN, plan_file
 
-    files = flight_files(*build(loaded), content_of_files(loaded))
+    built, origin = build(loaded), origin_of(loaded)
+    files: dict[str, str | bytes] = dict(flight_files(*built, content_of_files(loaded)))
+    files |= {PLAN: plan_file(*built, origin), **origin["files"]}
+    files[SCENARIO_FILE] = origin["provenance"]["scenario_text"]
     folder = Path(tempfile.mkdtemp(prefix="echelon-fly-")) if out is None else out
     save_flight(files, folder)
     return folder

@@ -91,10 +91,10 @@ def save_dataset(run: "Result | xr.Dataset", path: PathLike) -> None:
 
 def run_file(result: Result, data: Labelled | None = None) -> bytes:
     """Return `run.nc`: the dataset in groups, and the sums over all steps."""
-    return with_sums(result, data).netcdf(_group_of)
+    return with_sums(result, data).netcdf(group_of)
 
 
-def _group_of(name: str, dimensions: tuple[str, ...]) -> str:
+def group_of(name: str, dimensions: tuple[str, ...]) -> str:
     """Return the group of a variable: the first that has its dimensions, else one of its own."""
     if name.startswith(SUM):
         return f"sums/{name.removeprefix(SUM)}"

@@ -360,7 +360,7 @@ def _autopilot(model: ControlAffine, rest: list[float]) -> JsonObject:
     }
 
 
-def save_flight(files: dict[str, str], folder: Path) -> None:
+def save_flight(files: Mapping[str, str | bytes], folder: Path) -> None:
     """Write the files into a folder that is new or empty.
 
     Raises:

@@ -23,6 +23,7 @@ from echelon.experiments.scenario.scenario import (
 )
 from echelon.experiments.scenario.self_contained import names_files
 from echelon.output.archive.chunks import Chunks
+from echelon.output.archive.flown import PLAN, flight_data, root_of
 from echelon.output.archive.folder import (
     DATA,
     GAIN,
@@ -104,7 +105,7 @@ def write_findings(result: Result, folder: Path, figures: bool = True) -> None:
 
 
 def load(place: PathLike, parts: Parts | None = None) -> Result:
-    """Return the run in a folder, or in its `run.nc`, whatever its state.
+    """Return the run in a folder, or in its `run.nc`, whatever its state; or a flight.
 
     Of a run that was stopped or killed, or is still computed, it is what is stored. States and all
     else in `run.nc` are read without executing code; `parts` and what needs them (such as `report`,
@@ -112,7 +113,8 @@ def load(place: PathLike, parts: Parts | None = None) -> Result:
     names, as does a run that was killed before its `run.nc` was written.
 
     Args:
-        place: the folder of a run, or a netCDF file such as its `run.nc`.
+        place: the folder of a run, or a netCDF file such as its `run.nc`; the folder of a flight,
+            or that of one of its flights in `logs`, whose agents' logs are joined.
         parts: those of a run that was made in Python, which no file contains.
 
     Raises:
@@ -126,8 +128,11 @@ def load(place: PathLike, parts: Parts | None = None) -> Result:
         )
     path = check_exists(Path(place))
     if path.is_file():
-        return _stored(path, parts)
-    stored = _stored(path / DATA, parts) if (path / DATA).is_file() else None
+        return _stored(path, read_recording(path)[1], parts)
+    if root_of(path) is not None:
+        return _stored(*flight_data(path), parts)
+    file = path / DATA
+    stored = _stored(file, read_recording(file)[1], parts) if file.is_file() else None
     chunks = Chunks(path)
     if chunks.exist:
         segments = chunks.read()
@@ -154,9 +159,8 @@ def _unfinished(folder: Path, segments: list[Segment]) -> Result:
     return dataclasses.replace(result, **origin_of(scenario))
 
 
-def _stored(file: Path, parts: Parts | None) -> Result:
-    _, data = read_recording(file)
-    within = file.name == DATA
+def _stored(file: Path, data: Labelled, parts: Parts | None) -> Result:
+    within = file.name in (DATA, PLAN)
     names = sorted((file.parent / INPUTS).rglob("*")) if within else []
     files = {x.relative_to(file.parent).as_posix(): x.read_bytes() for x in names if x.is_file()}
     seconds = _seconds(file.with_name(SUMMARY)) if within else float("nan")
@@ -204,6 +208,11 @@ def _result(
 
 
 def _sums(file: Path, arrays: Mapping[str, Array]) -> Sums:
+    if file.name == PLAN:
+        raise OutputError(
+            "a flight has no sums over steps, which metrics are computed from; `echelon report "
+            "FLIGHT` prints its numbers."
+        )
     if any(SUM + name not in arrays for name in Sums._fields):
         raise OutputError(
             f"`{file}` has no sums over all steps, which metrics and the report are computed from; "
