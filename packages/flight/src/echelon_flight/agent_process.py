@@ -143,13 +143,13 @@ class AgentProcess:
         """Report a last time, let go of the vehicle, say why, and return that."""
         self.report(time.monotonic())
         self.context.link.close()
-        if self.context.log is not None:
-            self.context.log.close()
         if self.supervisor.fault is Fault.STOP:
             # Not while it descends: a disk may take long.
             with contextlib.suppress(FlightError):
                 self.context.wire.keep()
         self._say(f"{self.supervisor.sentence}; {self._summary()}")
+        if self.context.log is not None:
+            self.context.log.close()
         return self.supervisor.fault
 
     def interrupt(self) -> None:

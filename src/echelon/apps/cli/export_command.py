@@ -25,12 +25,13 @@ _MEMORY = 31
 
 def report(
     run: options.RunArgument,
+    beside: options.BesideOption = None,
     out: Annotated[
         Path | None, typer.Option(metavar="FILE.txt", help="Write it to this file instead.")
     ] = None,
     force: options.OverwriteOption = False,
 ) -> None:
-    """Print a run's numbers, the conditions of its guarantee, versions, and how to cite."""
+    """Print the numbers of a run or flight, the conditions of its guarantee, and its versions."""
     if out is not None:
         if ended := gone(VALUES, f"report --out {out.suffix.lower()}"):
             raise OutputError(f"a report as `{out.suffix}`{ended}")
@@ -40,7 +41,13 @@ def report(
     from echelon.output.archive.run_folder import load, report_beside
     from echelon.output.reports.run_report import whole_report
 
-    text = whole_report(recording_of(load(run)), report_beside(run))
+    recording = recording_of(load(run))
+    text = whole_report(recording, report_beside(run))
+    if beside is not None:
+        from echelon.experiments.results.beside import beside as compared
+
+        title, lines = f"Beside {beside}", compared(recording, recording_of(load(beside))).lines()
+        text = "\n".join([title, "-" * len(title), *lines, "", text])
     if out is None:
         print(text)
     else:

@@ -90,8 +90,9 @@ def save_dataset(run: "Result | xr.Dataset", path: PathLike) -> None:
 
 
 def run_file(result: Result, data: Labelled | None = None) -> bytes:
-    """Return `run.nc`: the dataset in groups, and the sums over all steps."""
-    return with_sums(result, data).netcdf(group_of)
+    """Return `run.nc`: the dataset in groups, and the sums over all steps; a flight has none."""
+    data = labelled(result) if data is None else data
+    return (data if "flight" in data.attributes else with_sums(result, data)).netcdf(group_of)
 
 
 def group_of(name: str, dimensions: tuple[str, ...]) -> str:

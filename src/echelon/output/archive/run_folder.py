@@ -198,7 +198,7 @@ def _result(
         warnings=tuple(attributes["warnings"].splitlines()),
         settings=settings,
         wall_time=seconds,
-        sums=Later(partial(_sums, file, arrays)),
+        sums=Later(partial(_sums, file, arrays, "flight" in attributes)),
         parts=Later(built),
         work=None if solver is None else SolverStats(**json.loads(solver)),
         engine=attributes["computed_by"],
@@ -207,8 +207,8 @@ def _result(
     )
 
 
-def _sums(file: Path, arrays: Mapping[str, Array]) -> Sums:
-    if file.name == PLAN:
+def _sums(file: Path, arrays: Mapping[str, Array], flown: bool) -> Sums:
+    if flown:
         raise OutputError(
             "a flight has no sums over steps, which metrics are computed from; `echelon report "
             "FLIGHT` prints its numbers."
