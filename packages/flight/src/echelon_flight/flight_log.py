@@ -12,7 +12,7 @@ import os
 import struct
 import threading
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple, final
 
@@ -114,7 +114,7 @@ class FlightLog:
         """Write nothing yet."""
         self._folder, self._facts, self.file, self.problem = folder, facts, None, ""
         self._descriptor, self._done, self._count = -1, threading.Event(), 0
-        self._numbers, self._none = struct.Struct(f"<{n + m}d"), (math.nan,) * m
+        self._whole, self._none = struct.Struct(f"{_TICK.format}{n + m}d"), (math.nan,) * m
         self._letter = struct.Struct(f"<Hd{size}d")
         self._letters, self._thread = list[bytes](), threading.Thread(target=self._sync)
         self._thread.daemon, self._broken = True, None
@@ -142,7 +142,7 @@ class FlightLog:
             flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND
             self._descriptor = os.open(file, flags, 0o644)
             self.file = file
-            self._put(_BEGIN.pack(MAGIC, VERSION) + _framed(_HEADER_KIND + header))
+            self._put(_HEADER_KIND + header, _BEGIN.pack(MAGIC, VERSION))
             self._thread.start()
         except (OSError, RuntimeError) as error:
             self._fail(error)
@@ -150,19 +150,33 @@ class FlightLog:
     def receive(self, sender: int, arrived: float, row: Sequence[float]) -> None:
         """Remember a letter until the next tick."""
         if self._descriptor >= 0:
-            self._try(lambda: self._letters.append(self._letter.pack(sender, arrived, *row)))
+            try:
+                self._letters.append(self._letter.pack(sender, arrived, *row))
+            except struct.error as error:
+                self._fail(error)
 
     def tick(self, tick: Tick) -> None:
         """Write a tick, with the letters since the last one in place of its own."""
-        if self._descriptor >= 0:
-            self._try(lambda: self._write_tick(tick))
+        if self._descriptor < 0:
+            return
+        t, letters, self._letters = tick, self._letters, []
+        state = t.missed, t.sent, len(letters), t.mode, t.fault, t.amount, t.battery
+        rest = *state, t.age, t.spent, t.leader, *t.x, *(t.u or self._none)
+        try:
+            head = self._whole.pack(_TICK_KIND, self._count, t.time, *rest)
+            self._put(b"".join((head, *letters)) if letters else head)
+        except (OSError, struct.error) as error:
+            self._fail(error)
+        self._count += 1
 
     def say(self, time: float | None, text: str) -> None:
         """Write a sentence, at a time of the plan (s)."""
         if self._descriptor >= 0:
             at = math.nan if time is None else time
-            body = _SENTENCE.pack(_SENTENCE_KIND, at) + text.encode()
-            self._try(lambda: self._put(_framed(body)))
+            try:
+                self._put(_SENTENCE.pack(_SENTENCE_KIND, at) + text.encode())
+            except (OSError, UnicodeError) as error:
+                self._fail(error)
 
     def close(self) -> None:
         """Write the file to the disk, and close it."""
@@ -172,26 +186,12 @@ class FlightLog:
             self._thread.join(2.0 * _SYNC)
         self._stop()
 
-    def _write_tick(self, tick: Tick) -> None:
-        t, letters = tick, self._letters
-        self._letters = []
-        state = t.missed, t.sent, len(letters), t.mode, t.fault, t.amount, t.battery
-        head = _TICK.pack(_TICK_KIND, self._count, t.time, *state, t.age, t.spent, t.leader)
-        self._count += 1
-        numbers = self._numbers.pack(*t.x, *(t.u or self._none))
-        self._put(_framed(b"".join((head, numbers, *letters))))
-
-    def _put(self, data: bytes) -> None:
+    def _put(self, body: bytes, before: bytes = b"") -> None:
+        if self._broken is not None:
+            raise self._broken
+        data = before + _FRAME.pack(len(body), zlib.crc32(body)) + body
         if os.write(self._descriptor, data) != len(data):
             raise OSError(None, "the disk is full")
-
-    def _try(self, act: Callable[[], object]) -> None:
-        try:
-            if self._broken is not None:
-                raise self._broken
-            act()
-        except (OSError, ValueError, struct.error) as error:
-            self._fail(error)
 
     def _fail(self, error: Exception) -> None:
         why = (getattr(error, "strerror", None) or str(error)).lower()
@@ -216,10 +216,6 @@ class FlightLog:
                 return
             if ends:
                 return
-
-
-def _framed(body: bytes) -> bytes:
-    return _FRAME.pack(len(body), zlib.crc32(body)) + body
 
 
 # ---- reading -------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def beside_figure(both: Beside, page: draw.FigureSize = draw.SCREEN) -> "Figure":
-    """Return a panel of distances, and one for each coordinate: flown solid, of the run dotted."""
+    """Return a panel of distances, and one for each coordinate: flown in colour, the run in grey dots."""
     run, agents = both.of, draw.drawn(both.of)
     keep, columns = draw.thin(len(both.times), 2 * len(agents)), run.measured[:3]
     times = both.times[keep]
@@ -27,7 +27,7 @@ def beside_figure(both: Beside, page: draw.FigureSize = draw.SCREEN) -> "Figure"
                 dotted = look | {"linestyle": ":", "color": draw.EDGE, "zorder": 3}
                 draw.plot(ax, times, both.run[keep, agent, k], **dotted)
         first.set_ylabel(draw.label("apart", run.length_unit))
-        first.set_title("flown: solid; run: dotted")
+        first.set_title("flown: in colour; run: grey dots")
         for k, ax in zip(columns, rest, strict=True):
             ax.set_ylabel(draw.label(run.state_names[k], run.state_units[k]))
         axes[-1][0].set_xlabel("time (s)")
