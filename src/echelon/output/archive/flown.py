@@ -248,7 +248,7 @@ class _Join:
         times, row = self.tracks[agent].times, self.rows[agent]
         if not len(times):
             return np.zeros(len(row), bool)
-        after = np.append(times[1:], times[-1] + self.stale)
+        after = np.append(times[1:], times[-1] + 1e-6)
         span = after - times <= self.stale + 1e-9
         return (row >= 0) & span[row] & (self.times < after[row])
 
