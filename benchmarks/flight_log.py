@@ -22,7 +22,7 @@ def inside() -> None:
     """Fly one agent as `python -m echelon_flight` does, and print what its log took."""
     from echelon_flight.__main__ import main
 
-    spent, used, during = [0.0], [0.0], list[float]()
+    spent, during = [0.0], list[float]()
     syncing, real = [0.0, 0.0], os.fsync
 
     def fsync(descriptor: int) -> None:
@@ -32,15 +32,12 @@ def inside() -> None:
 
     def timed(method: Any, last: bool) -> Any:
         def call(*arguments: Any) -> None:
-            busy = syncing[0]
-            wall, own = time.perf_counter(), time.thread_time()
+            busy, began = syncing[0], time.perf_counter()
             method(*arguments)
-            used[-1] += time.thread_time() - own
-            spent[-1] += time.perf_counter() - wall
+            spent[-1] += time.perf_counter() - began
             if last:
                 during.extend([spent[-1]] * bool(busy or syncing[0]))
                 spent.append(0.0)
-                used.append(0.0)
 
         return call
 
@@ -50,14 +47,9 @@ def inside() -> None:
     try:
         main()
     finally:
-        for name, values in {"of a processor": used, "on the clock": spent}.items():
-            values.sort()
-            shown = (1e6 * values[len(values) * k // 100] for k in (50, 90, 99))
-            texts = ", ".join(f"{value:.1f}" for value in shown)
-            mean = 1e6 * sum(values) / len(values)
-            print(
-                f"  {name}: {texts} us (50, 90, 99 %), mean {mean:.1f}, most {1e6 * values[-1]:.0f}"
-            )
+        spent.sort()
+        texts = ", ".join(f"{1e6 * spent[len(spent) * k // 100]:.1f}" for k in (50, 90, 99))
+        print(f"  a tick: {texts} us (50, 90, 99 %), {1e6 * spent[-1]:.0f} us at most")
         stall = 1e6 * max(during, default=0.0)
         print(f"  {len(during)} ticks during a sync: {stall:.0f} us at most; "
               f"longest sync {1e3 * syncing[1]:.1f} ms", flush=True)  # fmt: skip

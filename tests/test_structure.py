@@ -215,13 +215,15 @@ def test_flight_needs_the_standard_library_alone():
     assert found == {("crazyflie", "cflib"), ("px4", "pymavlink")}
 
 
-def test_echelon_knows_four_names_of_flight_and_its_version():
+def test_echelon_knows_few_names_of_flight_and_its_version():
     flight = importlib.import_module("echelon_flight")
     names = {name for _, name in imported() if package_of(name) == flight.__name__}
     found = {name.removeprefix(f"{flight.__name__}.") for name in names}
     assert found == {
         *("FlightError", "__version__"),
-        *("mission.check_options", "page_server.Handler"),
+        *("mission.check_options", "page_server.Handler", "parameters.DEFAULTS"),
+        *("flight_log.LogFile", "flight_log.Tick", "flight_log.find_logs", "flight_log.read_log"),
+        "supervisor.Fault",
     }
     assert flight.__version__ == CONTAINED
 

@@ -126,3 +126,8 @@ def test_the_supervisor_keeps_to_the_number_that_a_flight_has(name):
     assert DEFAULTS[name] == usual
     assert judged(name, usual, act) is fault
     assert judged(name, wider, act) is Fault.NONE
+
+
+def test_the_documentation_has_the_table():
+    page = (SOURCE.parents[3] / "docs" / "fly.md").read_text("utf-8")
+    assert page.split("<!-- parameters -->\n")[1].split("<!-- end -->")[0] == table()

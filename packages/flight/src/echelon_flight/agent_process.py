@@ -225,11 +225,9 @@ class AgentProcess:
         self._longest = max(self._longest, self._ticks[-1])
         supervisor.spend((time.thread_time() - began) * self.context.clock.speed / (1 + missed))
         supervisor.check(result.u, result.valid)
-        if supervisor.fault is not Fault.NONE:
-            self._log(t, reading, missed=missed)
-            return
-        said = self._act(result.u, result.letter, t)
-        self._log(t, reading, tuple(result.u), missed, said)
+        flies = supervisor.fault is Fault.NONE
+        said = flies and self._act(result.u, result.letter, t)
+        self._log(t, reading, tuple(result.u) if flies else (), missed, said)
 
     def _log(
         self,

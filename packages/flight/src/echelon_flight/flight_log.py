@@ -243,18 +243,7 @@ def read_log(file: Path) -> LogFile:
     Raises:
         FlightError: it cannot be read, is no log, is of another version, or its header is damaged.
     """
-    try:
-        data = file.read_bytes()
-    except OSError as error:
-        raise FlightError(f"`{file}` cannot be read ({(error.strerror or '').lower()}).") from None
-    if len(data) < _BEGIN.size or not data.startswith(MAGIC):
-        raise FlightError(f"`{file}` is no log of a flight, or its beginning is damaged.")
-    version = _BEGIN.unpack_from(data)[1]
-    if version != VERSION:
-        raise FlightError(
-            f"`{file}` is a log of version {version}, and this version reads {VERSION}; read it "
-            "with the version that wrote it."
-        )
+    data = _content(file)
     body, place = _next(data, _BEGIN.size)
     try:
         assert body is not None and body[:1] == _HEADER_KIND
@@ -269,6 +258,23 @@ def read_log(file: Path) -> LogFile:
             return log._replace(warning=_damage(file, log, len(data) - place))
         place = after
     return log
+
+
+def _content(file: Path) -> bytes:
+    """Return the bytes of a log of this version."""
+    try:
+        data = file.read_bytes()
+    except OSError as error:
+        raise FlightError(f"`{file}` cannot be read ({(error.strerror or '').lower()}).") from None
+    if len(data) < _BEGIN.size or not data.startswith(MAGIC):
+        raise FlightError(f"`{file}` is no log of a flight, or its beginning is damaged.")
+    version = _BEGIN.unpack_from(data)[1]
+    if version != VERSION:
+        raise FlightError(
+            f"`{file}` is a log of version {version}, and this version reads {VERSION}; read it "
+            "with the version that wrote it."
+        )
+    return data
 
 
 def _next(data: bytes, place: int) -> tuple[bytes | None, int]:

@@ -16,6 +16,7 @@ from echelon.output.archive.folder import check_empty, check_exists, claim_file,
 
 if TYPE_CHECKING:
     from echelon.agents.references.polynomials import Polynomials
+    from echelon.experiments.results.recording import Recording
     from echelon.simulation.engine.parts import Parts
 
 _LAW = "law"
@@ -42,16 +43,24 @@ def report(
     from echelon.output.reports.run_report import whole_report
 
     recording = recording_of(load(run))
-    text = whole_report(recording, report_beside(run))
-    if beside is not None:
-        from echelon.experiments.results.beside import beside as compared
-
-        title, lines = f"Beside {beside}", compared(recording, recording_of(load(beside))).lines()
-        text = "\n".join([title, "-" * len(title), *lines, "", text])
+    text = _beside(recording, beside) + whole_report(recording, report_beside(run))
     if out is None:
         print(text)
     else:
         write_file(out, text + "\n")
+
+
+def _beside(flown: "Recording", run: Path | None) -> str:
+    """Return where a flight and a run differ, as the first section of a report."""
+    if run is None:
+        return ""
+    from echelon.experiments.results.beside import beside
+    from echelon.experiments.results.recording import recording_of
+    from echelon.output.archive.run_folder import load
+
+    title = f"Beside {run}"
+    lines = beside(flown, recording_of(load(run))).lines()
+    return "\n".join([title, "-" * len(title), *lines, "", ""])
 
 
 def export(

@@ -67,15 +67,7 @@ def beside(flown: Recording, run: Recording) -> Beside:
         OutputError: they have other agents, states or inputs, the first is no flight, or they
             share no time.
     """
-    if "flight" not in flown.attributes:
-        raise OutputError("`--beside` compares a flight with a run, and the first is no flight.")
-    for what in ("agents", "state_names", "state_units", "input_names", "input_units"):
-        own, other = (json.dumps(getattr(each, what)) for each in (flown, run))
-        if own != other:
-            raise OutputError(
-                f"`--beside`: the run has the {what.replace('_', ' ')} {other}, and the flight "
-                f"{own}; give a run of the same scenario."
-            )
+    _check_alike(flown, run)
     within = (run.times >= flown.times[0] - 1e-9) & (run.times <= flown.times[-1] + 1e-9)
     if not within.any():
         raise OutputError("`--beside`: the flight and the run share no time.")
@@ -89,3 +81,15 @@ def beside(flown: Recording, run: Recording) -> Beside:
     away = np.where(here, np.linalg.norm(apart, axis=2), np.nan)
     inputs = flown.inputs[row], run.inputs[within]
     return Beside(times, states, run.states[within], *inputs, here, away, flown)
+
+
+def _check_alike(flown: Recording, run: Recording) -> None:
+    if "flight" not in flown.attributes:
+        raise OutputError("`--beside` compares a flight with a run, and the first is no flight.")
+    for what in ("agents", "state_names", "state_units", "input_names", "input_units"):
+        own, other = (json.dumps(getattr(each, what)) for each in (flown, run))
+        if own != other:
+            raise OutputError(
+                f"`--beside`: the run has the {what.replace('_', ' ')} {other}, and the flight "
+                f"{own}; give a run of the same scenario."
+            )

@@ -17,7 +17,7 @@ from echelon.experiments.results.dataset import digest_of, group_of, labelled_pa
 from echelon.experiments.results.labelled import Labelled, Variables, read_labelled
 from echelon.experiments.results.recording import Recording, recording
 from echelon.simulation.engine.parts import Parts
-from echelon.simulation.engine.prepare import prepare
+from echelon.simulation.engine.prepare import Prepared, prepare
 from echelon.simulation.engine.simulate import sample_reference
 from echelon.simulation.step.settings import Settings
 from echelon_flight import FlightError
@@ -42,15 +42,8 @@ def plan_file(parts: Parts, settings: Settings, origin: Mapping[str, Any]) -> by
     """
     prepared, settings = prepare(parts, settings), settings._replace(store_every=1)
     own, times = prepared.parts, settings.dt * np.arange(settings.steps + 1)
-    fixed, per_agent = labelled_parts(own, settings), ("time", "agent", "state")
-    reference = sample_reference(prepared, 0, len(times))
-    variables = dict(fixed.variables)
-    if reference is not None:
-        variables["reference"] = (("time", "state"), reference)
-    if own.formation.motion is not None:
-        variables["moving_offset"] = (per_agent, own.formation.offsets_at(times))
-    if own.world.network is not None:
-        variables["forget"] = ((), own.world.network.forget, {"units": "s"})
+    fixed = labelled_parts(own, settings)
+    variables = {**fixed.variables, **_over_plan(prepared, times)}
     provenance = origin["provenance"]
     attributes = {
         **provenance,
@@ -63,6 +56,19 @@ def plan_file(parts: Parts, settings: Settings, origin: Mapping[str, Any]) -> by
     }
     coordinates = {"time": ("time", times, {"units": "s"}), **fixed.coordinates}
     return Labelled(variables, coordinates, attributes).netcdf(group_of)
+
+
+def _over_plan(prepared: Prepared, times: Array) -> Variables:
+    """Return what is known of all times of the plan (T,), and of its network."""
+    own, variables = prepared.parts, Variables()
+    reference = sample_reference(prepared, 0, len(times))
+    if reference is not None:
+        variables["reference"] = (("time", "state"), reference)
+    if own.formation.motion is not None:
+        variables["moving_offset"] = (("time", "agent", "state"), own.formation.offsets_at(times))
+    if own.world.network is not None:
+        variables["forget"] = ((), own.world.network.forget, {"units": "s"})
+    return variables
 
 
 def root_of(place: Path) -> Path | None:
@@ -187,18 +193,21 @@ class _Join:
         own = ([x for x in logs if x.header["agent"] == k] for k in range(facts["agents"]))
         self.tracks = [_track(each, len(units), len(inputs), self.angles) for each in own]
         self.stale = max((x.header["parameters"]["stale_state"] for x in logs), default=0.0)
+        self._check_tracks()
+        self.frames = self._frames()
+        self.times = self.fixed["time"][self.frames]
+        self.rows = [np.searchsorted(x.times, self.times + 1e-9, "right") - 1 for x in self.tracks]
+
+    def _check_tracks(self) -> None:
         leaders = np.flatnonzero(self.fixed["is_leader"])
         for k, track in enumerate(self.tracks):
             if not len(track.times):
                 self.warnings.append(f"Agent {k} has no log of this flight, or it never flew.")
         if not any(len(self.tracks[k].times) for k in leaders):
             raise OutputError(
-                f"flight {number} has no log of its leader, agent {leaders[0]}; copy the folder "
-                "`logs` from its computer."
+                f"flight {self.number} has no log of its leader, agent {leaders[0]}; copy the "
+                "folder `logs` from its computer."
             )
-        self.frames = self._frames()
-        self.times = self.fixed["time"][self.frames]
-        self.rows = [np.searchsorted(x.times, self.times + 1e-9, "right") - 1 for x in self.tracks]
 
     def _frames(self) -> slice:
         """Return the frames of the plan that were flown, but for a ragged start and end."""
@@ -216,7 +225,7 @@ class _Join:
 
     def labelled(self) -> Labelled:
         """Return the arrays of the flight, with its report in the attributes."""
-        per_agent, frames = ("time", "agent", "state"), self.frames
+        per_agent = "time", "agent", "state"
         present = np.stack([self._present(k) for k in range(len(self.tracks))], axis=1)
         states, inputs = (np.stack([*part], axis=1) for part in zip(*map(self._at, self._all())))
         variables: Variables = {
@@ -227,18 +236,17 @@ class _Join:
             **self._ages(),
             **self._schedule(present),
         }
-        for name in ("reference", "moving_offset"):
-            if name in variables:
-                over, values, *_ = variables[name]
-                variables[name] = (over, values[frames])
+        for name in {"reference", "moving_offset"} & {*variables}:
+            over, values, *_ = variables[name]
+            variables[name] = (over, values[self.frames])
         variables |= self._tracking(states)
         coordinates = self.plan.coordinates | {"time": ("time", self.times, {"units": "s"})}
         self._compare_clocks()
         whole = Labelled(variables, coordinates, {**self.plan.attributes, **self._outcome()})
         flown = recording(whole.arrays(), whole.attributes)
         whole = whole._replace(variables=variables | {"error": (per_agent, flown.errors)})
-        report = "\n".join(self._report(flown))
-        return whole._replace(attributes=whole.attributes | {"flight_report": report})
+        report = {"flight_report": "\n".join(self._report(flown))}
+        return whole._replace(attributes=whole.attributes | report)
 
     def _all(self) -> range:
         return range(len(self.tracks))

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def beside_figure(both: Beside, page: draw.FigureSize = draw.SCREEN) -> "Figure":
-    """Return a panel of distances, and one for each coordinate: flown in colour, the run in grey dots."""
+    """Return panels of the distance and of each coordinate: flown in colour, the run dotted."""
     run, agents = both.of, draw.drawn(both.of)
     keep, columns = draw.thin(len(both.times), 2 * len(agents)), run.measured[:3]
     times = both.times[keep]
