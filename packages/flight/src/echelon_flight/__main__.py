@@ -119,9 +119,8 @@ def _fly(mission: Mission, options: argparse.Namespace) -> int:
         print(f"agent {options.agent}: all checks passed; nothing was sent to other agents.")
         return 0
     seconds = mission.facts["horizon"] if options.seconds is None else options.seconds
-    clock = PlanClock(options.speed)
-    log = mission.log(facts, options.link)
-    context = AgentContext(law, facts, mission.facts, link, socket, wire, clock, log)
+    rest = socket, wire, PlanClock(options.speed), mission.log(facts, options.link)
+    context = AgentContext(law, facts, mission.facts, link, *rest)
     fault = AgentProcess(context, seconds).run()
     return 0 if fault in (Fault.END, Fault.SIGNAL) else 1
 

@@ -51,7 +51,9 @@ ResumeOption = Annotated[
 RunArgument = Annotated[
     Path,
     typer.Argument(
-        metavar="RUN", help="The folder of a run, or its `run.nc`.", callback=check_exists
+        metavar="RUN",
+        help="The folder of a run or a flight, or its `run.nc`.",
+        callback=check_exists,
     ),
 ]
 BesideOption = Annotated[

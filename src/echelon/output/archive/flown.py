@@ -245,8 +245,10 @@ class _Join:
         whole = Labelled(variables, coordinates, {**self.plan.attributes, **self._outcome()})
         flown = recording(whole.arrays(), whole.attributes)
         whole = whole._replace(variables=variables | {"error": (per_agent, flown.errors)})
-        report = {"flight_report": "\n".join(self._report(flown))}
-        return whole._replace(attributes=whole.attributes | report)
+        return whole._replace(attributes=self._with_report(whole.attributes, flown))
+
+    def _with_report(self, attributes: JsonObject, flown: Recording) -> JsonObject:
+        return attributes | {"flight_report": "\n".join(self._report(flown))}
 
     def _all(self) -> range:
         return range(len(self.tracks))
