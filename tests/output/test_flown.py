@@ -34,10 +34,8 @@ simulation: {horizon: 2, dt: 0.02}
 N = 3
 
 
-@pytest.fixture(scope="module")
-def prepared(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("flown")
-    (folder / "carts.yaml").write_text(CARTS)
+def prepare(folder, text=CARTS):
+    (folder / "carts.yaml").write_text(text)
     scenario = ech.load_scenario(folder / "carts.yaml")
     parts, settings = ech.build(scenario)
     files = dict(flight_files(parts, settings, "carts"))
@@ -60,6 +58,11 @@ def flown(folder, key, monkeypatch, skews=(0.0,) * N, meanwhile=lambda flight: N
         flight.fly(8.0)
         assert len(flight.ended) == N, flight.ended
         return flight, flight.ground.wire.flight
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory):
+    return prepare(tmp_path_factory.mktemp("flown"))
 
 
 @pytest.fixture
@@ -193,6 +196,34 @@ def test_an_agent_that_was_killed_is_absent_until_it_is_back(prepared, tmp_path,
     assert away.min() == pytest.approx(gap[0], abs=0.05)
     assert away.max() == pytest.approx(gap[1], abs=0.15) and run.presence[-1, 1]
     assert len(find_logs(folder)[int(run.attributes["flight"])]) == N + 1
+
+
+def test_errors_are_beside_the_leader_of_the_moment(tmp_path, monkeypatch):
+    """By the leader that the followers' logs name: a backup leader, once the first one is gone."""
+    text = CARTS + "leadership: {backups: [1], timeout: 0.3}\n"
+    folder = prepare(tmp_path, text.replace("[1, 2]]", "[1, 2], [0, 2]]"))
+
+    def kill(flight):
+        flight.fly(0.8)
+        flight.ended[0] = Fault.NONE
+        flight.kill(0)
+
+    flown(folder, tmp_path / "key", monkeypatch, meanwhile=kill)
+    run, logs = recording_of(ech.load(folder)), logs_of(folder)
+    assert run.presence[:, 1:].all() and not run.presence[-1, 0]
+    taken = next(tick.time for tick in logs[2].ticks if tick.leader == 1)
+    nearest = run.nearest_then[:, 2]
+    assert (nearest == np.where(run.times < taken - 1e-9, 0, 1)).all() and nearest[-1] == 1
+    away = run.states[-1, 2, :2] - run.states[-1, 1, :2] - [1.0, 0.0]
+    assert run.formation_errors[-1, 2] == pytest.approx(np.linalg.norm(away), abs=1e-12)
+
+
+def test_a_law_that_is_not_the_one_that_flew_is_named(flight):
+    file = flight / "law-1" / "law.json"
+    facts = json.loads(file.read_text())
+    file.write_text(json.dumps(facts | {"sha256": {"law.py": "cd" * 32}}))
+    [warning] = ech.load(flight).warnings
+    assert warning == f"The law of agent 1 in `{flight}` is not the one that flew."
 
 
 def test_an_early_end_says_why(prepared, tmp_path, monkeypatch):

@@ -107,11 +107,11 @@ def flight_data(place: Path) -> tuple[Path, Labelled]:
         )
     (number, files), plan = *found.items(), read_labelled(root / PLAN)
     facts = json.loads((root / _FACTS).read_text("utf-8"))
-    logs, warnings = _logs(files, facts)
+    logs, warnings = _logs(files, facts, root)
     return root / PLAN, _Join(plan, facts, logs, number, warnings).labelled()
 
 
-def _logs(files: Sequence[Path], facts: JsonObject) -> tuple[list[LogFile], list[str]]:
+def _logs(files: Sequence[Path], facts: JsonObject, root: Path) -> tuple[list[LogFile], list[str]]:
     """Return the logs that can be read, and what is wrong with any."""
     logs, warnings = list[LogFile](), list[str]()
     for file in files:
@@ -125,6 +125,10 @@ def _logs(files: Sequence[Path], facts: JsonObject) -> tuple[list[LogFile], list
                 f"`{file}` is of another formation than its folder; put it into the folder that "
                 "its process flew."
             )
+        agent = log.header["agent"]
+        law = root / f"law-{agent}" / "law.json"
+        if law.is_file() and json.loads(law.read_bytes())["sha256"]["law.py"] != log.header["law"]:
+            warnings.append(f"The law of agent {agent} in `{root}` is not the one that flew.")
         logs.append(log)
         warnings += [log.warning] if log.warning else []
     return logs, warnings
