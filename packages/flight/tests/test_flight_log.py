@@ -220,6 +220,16 @@ def test_letters_are_logged_with_their_ages_and_faults_with_their_sentences(tmp_
     assert [x.sent for x in read.ticks].count(True) > 0
 
 
+def test_a_fault_after_which_no_state_comes_is_logged_once(tmp_path, monkeypatch):
+    scene, log = scene_with_log(monkeypatch, tmp_path)
+    scene.start()
+    scene.link.silent = True
+    scene.rounds(60)
+    ticks = read_log(log.file).ticks
+    assert [list(Fault)[tick.fault] for tick in ticks[-2:]] == [Fault.NONE, Fault.STALE]
+    assert ticks[-1].age == pytest.approx(ticks[-1].amount, abs=0.02) and ticks[-1].age > 0.1
+
+
 def test_each_process_of_each_flight_has_a_file_of_its_own(tmp_path):
     files = [write(tmp_path / "logs", []) for _ in range(2)]
     other = FlightLog(tmp_path / "logs", HEADER, 2, 1, 3)

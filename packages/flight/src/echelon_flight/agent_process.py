@@ -125,7 +125,7 @@ class AgentProcess:
         self.pilot = Pilot(context.law, context.facts, leadership["backups"], ahead)
         self._reading: Reading | None = None
         self._began, self._ticked, self._fell = time.monotonic(), -math.inf, math.inf
-        self._due = 0.0
+        self._due, self._fault_logged = 0.0, False
         self._sent, self._reported, self._signals = -math.inf, -math.inf, 0
         self._moved = self._heard_at = self._began
         self._said, self._notes = set[str](), deque[str](maxlen=10)
@@ -241,6 +241,7 @@ class AgentProcess:
         if log is None:
             return
         fault = 0 if supervisor.fault is Fault.NONE else list(Fault).index(supervisor.fault)
+        self._fault_logged = fault > 0
         age = (time.monotonic() - reading.time) * self.context.clock.speed
         battery = math.nan if reading.battery is None else reading.battery
         state = missed, sent, 1 + (fault > 0), fault, supervisor.amount, self.pilot.leader, age
@@ -279,6 +280,9 @@ class AgentProcess:
         return said
 
     def _descend(self) -> None:
+        if not self._fault_logged and self._reading is not None:
+            # No state may come any more.
+            self._log(self.context.clock.now or math.nan, self._reading)
         self._say(f"{self.supervisor.sentence}; the vehicle levels and descends", "fault")
         try:
             if self._ticked >= 0.0:
