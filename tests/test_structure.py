@@ -212,7 +212,8 @@ def test_flight_needs_the_standard_library_alone():
     pairs = {(m.rpartition(".")[2], name.split(".")[0]) for m, name in flight}
     own = {"echelon_flight", *sys.stdlib_module_names}
     found = {each for each in pairs if each[1] not in own}
-    assert found == {("crazyflie", "cflib"), ("px4", "pymavlink")}
+    dds = {(module, "cyclonedds") for module in ("ros2", "ros2_messages")}
+    assert found == {("crazyflie", "cflib"), ("px4", "pymavlink"), *dds}
 
 
 def test_echelon_knows_four_names_of_flight_and_its_version():

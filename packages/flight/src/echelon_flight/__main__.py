@@ -6,6 +6,7 @@ import math
 import signal
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from echelon_flight import FlightError, __version__
@@ -22,7 +23,7 @@ from echelon_flight.datagram_socket import (
 from echelon_flight.links import Link, open_link
 from echelon_flight.mission import Mission
 from echelon_flight.supervisor import Fault
-from echelon_flight.wire import GROUND
+from echelon_flight.wire import GROUND, Report
 
 _READY = 5.0  # s, within which a state of the vehicle must arrive
 
@@ -48,8 +49,9 @@ def _options() -> argparse.Namespace:
     say("--agent", type=int, help="fly this agent")
     say("--all", action="store_true", help="fly all, with simulated vehicles")
     say("--ground", action="store_true", help="serve the page of the ground station")
+    say("--ros2", action="store_true", help="publish poses, goals and markers to ROS 2")
     say("--dry-run", action="store_true", help="check everything, and send nothing to others")
-    say("--link", default="udp", help="to the vehicle: udp, cflib://.. or px4://..")
+    say("--link", default="udp", help="to the vehicle: udp, cflib://.., px4://.. or ros2://..")
     say("--key", type=Path, help="the key file of the formation")
     say("--listen", help="address and port to hear others at")
     say("--to", help="addresses and ports of others, separated by commas")
@@ -72,6 +74,8 @@ def _run(mission: Mission, options: argparse.Namespace) -> int:
     if options.seconds is not None and not options.seconds > 0.0:
         raise FlightError(f"`--seconds` is {options.seconds:g}, and must be above 0.")
     # Imported where they are used: an agent's process stays small.
+    if options.ros2 and not (options.ground or options.all):
+        raise FlightError("`--ros2` is for the ground station: give it with `--ground` or `--all`.")
     if options.vehicles:
         from echelon_flight.simulated_vehicles import Vehicles, simulated
 
@@ -151,7 +155,8 @@ def _watch(mission: Mission, options: argparse.Namespace) -> int:
 
     listen, to = _ways(mission, GROUND, options)
     wire = mission.wire(GROUND, options.key)
-    ground = Ground(DatagramSocket(listen, to, options.interface), wire, mission.agents)
+    socket = DatagramSocket(listen, to, options.interface)
+    ground = Ground(socket, wire, mission.agents, _view(mission, options))
     ground.listen()
     with page_of(ground).serving() as address:
         where = f"the ground station is at {address}"
@@ -160,6 +165,15 @@ def _watch(mission: Mission, options: argparse.Namespace) -> int:
             while True:
                 time.sleep(1.0)
     return 0
+
+
+def _view(mission: Mission, options: argparse.Namespace) -> Callable[[int, Report], None]:
+    """Return who takes reports besides the ground station's page."""
+    if not options.ros2:
+        return lambda number, report: None
+    from echelon_flight.ros2_view import Ros2View
+
+    return Ros2View(mission.facts).report
 
 
 def _fly_all(mission: Mission, options: argparse.Namespace) -> int:
@@ -171,7 +185,8 @@ def _fly_all(mission: Mission, options: argparse.Namespace) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     for k in range(mission.agents):
         mission.law(k)
-    flight = LocalFlight(mission, seconds, options.speed, options.port)
+    watch = _view(mission, options)
+    flight = LocalFlight(mission, seconds, options.speed, options.port, watch=watch)
     if options.dry_run:
         print("All checks passed; nothing was started.")
         return 0

@@ -21,10 +21,15 @@ _SCENARIO = "The name of a bundled scenario, a YAML file, or a folder that `--ou
 _Number = Annotated[int | None, typer.Option(help="Fly this agent.")]
 _All = Annotated[bool, typer.Option("--all", help="Fly all agents, with simulated vehicles.")]
 _Ground = Annotated[bool, typer.Option("--ground", help="Serve the ground station's page.")]
+_Ros = Annotated[
+    bool, typer.Option("--ros2", help="Publish poses, goals and markers to ROS 2, from the ground.")
+]
 _Dry = Annotated[
     bool, typer.Option("--dry-run", help="Check everything, and send nothing to others.")
 ]
-_Link = Annotated[str, typer.Option(help="Link to the vehicle: udp, cflib://... or px4://...")]
+_Link = Annotated[
+    str, typer.Option(help="Link to the vehicle: udp, cflib://..., px4://... or ros2://...")
+]
 _Key = Annotated[Path | None, typer.Option(help="Key file that all agents and the ground share.")]
 _Listen = Annotated[
     str | None, typer.Option(help="Receive from others at ADDRESS:PORT, as of a multicast group.")
@@ -49,6 +54,7 @@ def fly(
     every: _All = False,
     ground: _Ground = False,
     dry_run: _Dry = False,
+    ros2: _Ros = False,
     link: _Link = "udp",
     key: _Key = None,
     listen: _Listen = None,
@@ -72,7 +78,7 @@ def fly(
         **{"--interface": interface, "--seconds": seconds, "--speed": speed},
     }
     words = [str(word) for pair in given.items() if pair[1] is not None for word in pair]
-    flags = {"--all": every, "--ground": ground, "--dry-run": dry_run}
+    flags = {"--all": every, "--ground": ground, "--dry-run": dry_run, "--ros2": ros2}
     words += [flag for flag, is_set in flags.items() if is_set]
     STATUS.pause()
     sys.stdout.flush()

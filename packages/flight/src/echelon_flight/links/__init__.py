@@ -15,6 +15,7 @@ LINKS: Final = {
     "udp": "echelon_flight.links.udp:UdpLink",
     "cflib": "echelon_flight.links.crazyflie:CflibLink",
     "px4": "echelon_flight.links.px4:Px4Link",
+    "ros2": "echelon_flight.links.ros2:Ros2Link",
 }
 """Scheme of an address -> `module:class`."""
 
