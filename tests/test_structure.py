@@ -372,8 +372,8 @@ def test_every_dependency_is_pinned_imported_or_has_its_reason():
     assert required - pinned == {project()["name"]}
     assert "://" not in text and "\n-" not in text
     optional = (
-        *("certify", "cluster", "control", "crazyflie", "fast"),
-        *("optimal", "parquet", "px4", "video"),
+        *("bags", "certify", "cluster", "control", "crazyflie", "fast"),
+        *("optimal", "parquet", "px4", "ros2", "video"),
     )
     names = [*project()["dependencies"], *itertools.chain(*(extras[name] for name in optional))]
     used = {name.split(".")[0] for _, name in imported() | imported("echelon_flight")}

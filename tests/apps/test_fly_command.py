@@ -52,7 +52,7 @@ REFUSED = {
     "": "give one of `--agent` with a number, `--all`, `--ground` and `--out`.",
     "--agent 0": "give `--key` with the key file, which all agents and the ground share.",
     "--ground --key none": "the key file `none` cannot be read",
-    "--all --link radio://0": "`--link` is `radio://0`, and must begin with `udp`, `cflib`, `px4`, `ros2`.",
+    "--all --link radio://0": "`--link` is `radio://0`, and must begin with `udp`, `cflib`, `px4`",
 }
 
 
