@@ -6,6 +6,7 @@ import math
 import signal
 import sys
 import time
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
@@ -47,6 +48,7 @@ def _options() -> argparse.Namespace:
     say("--version", action="version", version=f"echelon-flight {__version__}")
     say("folder", type=Path, help="a folder that `echelon fly --out` wrote")
     say("--agent", type=int, help="fly this agent")
+    say("--agents", help="fly these agents, such as 0,1,2, by one process and one dongle")
     say("--all", action="store_true", help="fly all, with simulated vehicles")
     say("--ground", action="store_true", help="serve the page of the ground station")
     say("--ros2", action="store_true", help="publish poses, goals and markers to ROS 2")
@@ -89,8 +91,10 @@ def _run(mission: Mission, options: argparse.Namespace) -> int:
         return _fly_all(mission, options)
     if options.ground:
         return _watch(mission, options)
+    if options.agents is not None:
+        return _fly_several(mission, options)
     if options.agent is None:
-        raise FlightError("give `--agent` with a number, `--all` or `--ground`.")
+        raise FlightError("give `--agent` with a number, `--agents`, `--all` or `--ground`.")
     return _fly(mission, options)
 
 
@@ -108,27 +112,74 @@ def _ways(
 
 def _fly(mission: Mission, options: argparse.Namespace) -> int:
     """Fly one agent."""
-    wire = mission.wire(options.agent, options.key)
-    listen, to = _ways(mission, options.agent, options)
+    context = _context(mission, options, options.agent, options.link)
+    if options.dry_run:
+        _check_state(context, options.link)
+        return 0
+    fault = AgentProcess(context, _seconds(mission, options)).run()
+    return 0 if fault in (Fault.END, Fault.SIGNAL) else 1
+
+
+def _fly_several(mission: Mission, options: argparse.Namespace) -> int:
+    """Fly several agents by this process."""
+    from echelon_flight import one_process
+
+    numbers = one_process.read_numbers(options.agents, mission.agents)
+    links = one_process.read_links(options.link, numbers)
+    inboxes = {k: deque[bytes]() for k in numbers}
+    parameters = mission.facts.get("parameters", {})
+    carried = parameters.get("radio_setpoints", one_process.SETPOINTS)
+    contexts = []
+    for k, link in zip(numbers, links, strict=True):
+        own = _context(mission, options, k, link)
+        socket = one_process.SharedSocket(own.socket, k, inboxes)
+        if isinstance(own.link, one_process.CflibLink):
+            radio = own.link, own.facts, mission.facts, own.clock, len(numbers)
+            own = own._replace(link=one_process.SharedRadioLink(*radio))
+        contexts.append(own._replace(socket=socket))
+    if links[0].startswith("cflib"):
+        if sentence := one_process.warn(mission.facts["dt"], carried, len(numbers)):
+            print(f"echelon-flight: {sentence}", file=sys.stderr, flush=True)
+    if options.dry_run:
+        for context, link in zip(contexts, links, strict=True):
+            _check_state(context, link)
+        return 0
+    for context in contexts:
+        context.socket.skip()
+    seconds = _seconds(mission, options)
+    faults = one_process.fly_together([AgentProcess(each, seconds) for each in contexts])
+    return 0 if {*faults} <= {Fault.END, Fault.SIGNAL} else 1
+
+
+def _seconds(mission: Mission, options: argparse.Namespace) -> float:
+    return mission.facts["horizon"] if options.seconds is None else options.seconds
+
+
+def _context(
+    mission: Mission, options: argparse.Namespace, number: int, address: str
+) -> AgentContext:
+    """Return what an agent uses, with an open link; tell the ground where that fails."""
+    wire = mission.wire(number, options.key)
+    listen, to = _ways(mission, number, options)
     try:
-        law, facts = mission.law(options.agent)
+        law, facts = mission.law(number)
         socket = DatagramSocket(listen, to, options.interface)
-        link = open_link(options.link, facts)
+        link = open_link(address, facts)
     except FlightError as error:
         if not options.dry_run:
             tell_once(wire.note(time.time(), str(error).rstrip(".")), to, options.interface)
         raise
     # The start may have been said often while the link was opened.
     socket.skip()
-    if options.dry_run:
-        _wait_for_state(link, options.link)
-        print(f"agent {options.agent}: all checks passed; nothing was sent to other agents.")
-        return 0
-    seconds = mission.facts["horizon"] if options.seconds is None else options.seconds
     clock = PlanClock(options.speed)
-    context = AgentContext(law, facts, mission.facts, link, socket, wire, clock)
-    fault = AgentProcess(context, seconds).run()
-    return 0 if fault in (Fault.END, Fault.SIGNAL) else 1
+    return AgentContext(law, facts, mission.facts, link, socket, wire, clock)
+
+
+def _check_state(context: AgentContext, address: str) -> None:
+    """Wait for a state of the vehicle, and say that all is well."""
+    _wait_for_state(context.link, address)
+    number = context.wire.number
+    print(f"agent {number}: all checks passed; nothing was sent to other agents.")
 
 
 def _wait_for_state(link: Link, address: str) -> None:

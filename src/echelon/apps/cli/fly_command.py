@@ -19,6 +19,9 @@ CONTAINED = "0.1.0"
 """The version of the package `echelon_flight` that is installed with echelon."""
 _SCENARIO = "The name of a bundled scenario, a YAML file, or a folder that `--out` wrote."
 _Number = Annotated[int | None, typer.Option(help="Fly this agent.")]
+_Numbers = Annotated[
+    str | None, typer.Option(help="Fly these agents, such as 0,1,2, by one process and dongle.")
+]
 _All = Annotated[bool, typer.Option("--all", help="Fly all agents, with simulated vehicles.")]
 _Ground = Annotated[bool, typer.Option("--ground", help="Serve the ground station's page.")]
 _Ros = Annotated[
@@ -51,6 +54,7 @@ _Out = Annotated[
 def fly(
     scenario: Annotated[str, typer.Argument(help=_SCENARIO)],
     agent: _Number = None,
+    agents: _Numbers = None,
     every: _All = False,
     ground: _Ground = False,
     dry_run: _Dry = False,
@@ -66,7 +70,7 @@ def fly(
 ) -> None:
     """Fly a scenario: a process for each agent, which needs neither JAX nor NumPy."""
     _check_version()
-    _check(agent, every, ground, key, link, out)
+    _check(agent, agents, every, ground, key, link, out)
     folder = Path(scenario)
     if not (folder / "flight.json").is_file():
         folder = _prepare(scenario, set_ or [], out)
@@ -74,8 +78,8 @@ def fly(
         print(f"- Written to {folder}; `echelon fly {folder} --all` flies it.")
         return
     given = {
-        **{"--agent": agent, "--link": link, "--key": key, "--listen": listen},
-        **{"--interface": interface, "--seconds": seconds, "--speed": speed},
+        **{"--agent": agent, "--agents": agents, "--link": link, "--key": key},
+        **{"--listen": listen, "--interface": interface, "--seconds": seconds, "--speed": speed},
     }
     words = [str(word) for pair in given.items() if pair[1] is not None for word in pair]
     flags = {"--all": every, "--ground": ground, "--dry-run": dry_run, "--ros2": ros2}
@@ -102,15 +106,23 @@ def _check_version() -> None:
 
 
 def _check(
-    agent: int | None, every: bool, ground: bool, key: Path | None, link: str, out: Path | None
+    agent: int | None,
+    agents: str | None,
+    every: bool,
+    ground: bool,
+    key: Path | None,
+    link: str,
+    out: Path | None,
 ) -> None:
     """Check what can be, before the laws are written, which takes long."""
     from echelon_flight.mission import check_options
 
-    tasks = [agent is not None, every, ground, out is not None]
-    if sum(tasks) != 1:
-        raise FlightError("give one of `--agent` with a number, `--all`, `--ground` and `--out`.")
-    check_options(link, key, signs=agent is not None or ground)
+    flies = agent is not None or agents is not None
+    if sum((agent is not None, agents is not None, every, ground, out is not None)) != 1:
+        raise FlightError(
+            "give one of `--agent` with a number, `--agents`, `--all`, `--ground` and `--out`."
+        )
+    check_options(link, key, signs=flies or ground)
 
 
 def _prepare(scenario: str, changes: list[str], out: Path | None) -> Path:

@@ -46,10 +46,12 @@ class Link(abc.ABC):
         inputs: the names of the law's inputs that it can send, in order, such as
             `("roll", "pitch", "yaw_rate", "thrust")`; None for any.
         watchdog: whether the vehicle levels by itself when inputs no longer arrive.
+        notice: what the ground should know of the link, a sentence without its full stop; or "".
     """
 
     inputs: ClassVar[tuple[str, ...] | None] = None
     watchdog: ClassVar[bool] = False
+    notice: str = ""
 
     @abc.abstractmethod
     def __init__(self, address: str, facts: Mapping[str, Any]) -> None:

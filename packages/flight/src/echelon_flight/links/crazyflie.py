@@ -111,6 +111,12 @@ class CflibLink(Link):
             setpoint = full_state_setpoint(self._known, u)
             self._crazyflie.commander.send_full_state_setpoint(*setpoint)
 
+    def hover(self, place: Sequence[float], yaw: float) -> None:
+        """Let the firmware hold a place (m) and a yaw (rad) by its own position controller."""
+        if self._locked:
+            self._unlock()
+        self._crazyflie.commander.send_position_setpoint(*place, math.degrees(yaw))
+
     def level_descend(self) -> None:
         """Let the vehicle sink level, then switch its motors off."""
         now, low = time.monotonic(), self._known.get("z", math.inf) < _GROUND
