@@ -7,7 +7,7 @@ import signal
 import sys
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from echelon_flight import FlightError, __version__
@@ -54,6 +54,7 @@ def _options() -> argparse.Namespace:
     say("--ros2", action="store_true", help="publish poses, goals and markers to ROS 2")
     say("--dry-run", action="store_true", help="check everything, and send nothing to others")
     say("--link", default="udp", help="to the vehicle: udp, cflib://.., px4://.. or ros2://..")
+    say("--positions", type=Path, help="a Python file whose class `Positions` yields positions")
     say("--key", type=Path, help="the key file of the formation")
     say("--listen", help="address and port to hear others at")
     say("--to", help="addresses and ports of others, separated by commas")
@@ -113,6 +114,7 @@ def _ways(
 def _fly(mission: Mission, options: argparse.Namespace) -> int:
     """Fly one agent."""
     context = _context(mission, options, options.agent, options.link)
+    _forward(options, [context])
     if options.dry_run:
         _check_state(context, options.link)
         return 0
@@ -129,14 +131,16 @@ def _fly_several(mission: Mission, options: argparse.Namespace) -> int:
     inboxes = {k: deque[bytes]() for k in numbers}
     parameters = mission.facts.get("parameters", {})
     carried = parameters.get("radio_setpoints", one_process.SETPOINTS)
-    contexts = []
+    contexts, direct = [], []
     for k, link in zip(numbers, links, strict=True):
         own = _context(mission, options, k, link)
+        direct.append(own)
         socket = one_process.SharedSocket(own.socket, k, inboxes)
         if isinstance(own.link, one_process.CflibLink):
             radio = own.link, own.facts, mission.facts, own.clock, len(numbers)
             own = own._replace(link=one_process.SharedRadioLink(*radio))
         contexts.append(own._replace(socket=socket))
+    _forward(options, direct)
     if links[0].startswith("cflib"):
         if sentence := one_process.warn(mission.facts["dt"], carried, len(numbers)):
             print(f"echelon-flight: {sentence}", file=sys.stderr, flush=True)
@@ -149,6 +153,20 @@ def _fly_several(mission: Mission, options: argparse.Namespace) -> int:
     seconds = _seconds(mission, options)
     faults = one_process.fly_together([AgentProcess(each, seconds) for each in contexts])
     return 0 if {*faults} <= {Fault.END, Fault.SIGNAL} else 1
+
+
+def _forward(options: argparse.Namespace, contexts: Sequence[AgentContext]) -> None:
+    """Forward positions from the file that `--positions` names."""
+    if options.positions is None:
+        return
+    from echelon_flight.links.crazyflie import CflibLink
+    from echelon_flight.positions import PositionForwarder, load_positions
+
+    links = {each.wire.number: each.link for each in contexts}
+    known = {k: link for k, link in links.items() if isinstance(link, CflibLink)}
+    if len(known) < len(links):
+        raise FlightError("`--positions` is for the link `cflib`; other vehicles have their own.")
+    PositionForwarder(load_positions(options.positions), known).start()
 
 
 def _seconds(mission: Mission, options: argparse.Namespace) -> float:

@@ -33,6 +33,9 @@ _Dry = Annotated[
 _Link = Annotated[
     str, typer.Option(help="Link to the vehicle: udp, cflib://..., px4://... or ros2://...")
 ]
+_Positions = Annotated[
+    Path | None, typer.Option(help="A Python file whose class `Positions` yields positions.")
+]
 _Key = Annotated[Path | None, typer.Option(help="Key file that all agents and the ground share.")]
 _Listen = Annotated[
     str | None, typer.Option(help="Receive from others at ADDRESS:PORT, as of a multicast group.")
@@ -61,6 +64,7 @@ def fly(
     ros2: _Ros = False,
     link: _Link = "udp",
     key: _Key = None,
+    positions: _Positions = None,
     listen: _Listen = None,
     interface: _Interface = None,
     seconds: _Seconds = None,
@@ -79,7 +83,13 @@ def fly(
         return
     given = {
         **{"--agent": agent, "--agents": agents, "--link": link, "--key": key},
-        **{"--listen": listen, "--interface": interface, "--seconds": seconds, "--speed": speed},
+        **{
+            "--positions": positions,
+            "--listen": listen,
+            "--interface": interface,
+            "--seconds": seconds,
+            "--speed": speed,
+        },
     }
     words = [str(word) for pair in given.items() if pair[1] is not None for word in pair]
     flags = {"--all": every, "--ground": ground, "--dry-run": dry_run, "--ros2": ros2}

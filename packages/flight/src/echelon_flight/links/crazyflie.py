@@ -28,8 +28,12 @@ _FULL_THRUST: Final = 0.48
 """Of four motors of a Crazyflie 2.1+ with the firmware's compensation of its battery, N."""
 _PATIENCE: Final = 20.0
 """s until a Crazyflie has told its variables and parameters."""
+_UNPLACED: Final = 0.5
+"""s without a position from outside, from which on the estimate is not trusted."""
 _VOLTS: Final = (3.0, 4.1)
 """Of an empty and of a full battery, in flight."""
+_KALMAN: Final = 2
+"""The firmware's estimator that takes positions."""
 _SINKING, _GROUND, _LONGEST = 0.93, 0.05, 5.0
 """A descent: the share of the weight (0.7 m/s^2), its end above z = 0 (m), or at the latest (s)."""
 
@@ -84,7 +88,7 @@ class CflibLink(Link):
         self._arrival = threading.Condition()
         self._newest: Reading | None = None
         self._known: dict[str, float] = {}
-        self._failure = ""
+        self._failure, self._placed = "", math.inf
         self._owns = crazyflie is None
         self._crazyflie = _connected(uri) if crazyflie is None else crazyflie
         self._crazyflie.connection_lost.add_callback(lambda _, why: self._fail(why))
@@ -92,11 +96,13 @@ class CflibLink(Link):
 
     def read(self, wait: float) -> Reading | None:
         """Return the newest state that was not yet returned."""
+        if time.monotonic() > self._placed + _UNPLACED:
+            self.lose(f"no position came from outside for {_UNPLACED:g} s")
         with self._arrival:
             if self._newest is None and wait > 0.0 and not self._failure:
                 self._arrival.wait(wait)
             reading, self._newest = self._newest, None
-        if reading is None and self._failure:
+        if (reading is None or self._placed < math.inf) and self._failure:
             raise FlightError(f"the link to the Crazyflie failed: {self._failure}.")
         return reading
 
@@ -116,6 +122,22 @@ class CflibLink(Link):
         if self._locked:
             self._unlock()
         self._crazyflie.commander.send_position_setpoint(*place, math.degrees(yaw))
+
+    def expect_positions(self, within: float) -> None:
+        """Fail if no position came from outside within a time (s), and choose the estimator."""
+        self._crazyflie.param.set_value("stabilizer.estimator", _KALMAN)
+        self._placed = time.monotonic() + within - _UNPLACED
+
+    def locate(self, pose: Sequence[float]) -> None:
+        """Send a place (m), with or without a quaternion (x, y, z, w), to the estimator."""
+        self._placed, sender = time.monotonic(), self._crazyflie.extpos
+        (sender.send_extpos if len(pose) == 3 else sender.send_extpose)(*pose)
+
+    def lose(self, why: str) -> None:
+        """Let the link fail, and so the vehicle descend; states no longer count."""
+        with self._arrival:
+            self._newest = None
+        self._fail(why)
 
     def level_descend(self) -> None:
         """Let the vehicle sink level, then switch its motors off."""
