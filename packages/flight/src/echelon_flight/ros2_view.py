@@ -3,10 +3,12 @@
 # The library's sequences are lists in Python.
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false
 
+import contextlib
 import math
 from collections.abc import Mapping
 from typing import Any, Final, final
 
+from echelon_flight import FlightError
 from echelon_flight.links.ros2 import Node
 from echelon_flight.local_flight import offsets_at
 from echelon_flight.wire import Report
@@ -53,7 +55,9 @@ class Ros2View:
             offsets = offsets_at(self._facts["offsets"], max(0.0, report.time))
             parts = zip(self._places[leader], offsets[number], offsets[leader], strict=True)
             self._goals[number] = [x + b - a for x, b, a in parts]
-        self._publish(number)
+        # What cannot be shown stops no ground station.
+        with contextlib.suppress(FlightError):
+            self._publish(number)
 
     def _publish(self, number: int) -> None:
         from echelon_flight.links import ros2_messages as ros
