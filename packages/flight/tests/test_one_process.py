@@ -1,16 +1,22 @@
 """Several agents in one process: their options, their letters, and their share of a radio."""
 
+import subprocess
+import sys
 import threading
+import time
 from collections import deque
 from types import SimpleNamespace
 
 import pytest
+import two_points
 from agent_scene import letter
 from free_port import free_port
 
 from echelon_flight import FlightError, one_process
-from echelon_flight.datagram_socket import DatagramSocket
+from echelon_flight.datagram_socket import DatagramSocket, ports_of
+from echelon_flight.ground import Ground
 from echelon_flight.links import Reading
+from echelon_flight.mission import Mission, make_key
 from echelon_flight.one_process import (
     SharedRadioLink,
     SharedSocket,
@@ -20,7 +26,7 @@ from echelon_flight.one_process import (
     warn,
 )
 from echelon_flight.supervisor import Fault
-from echelon_flight.wire import Wire
+from echelon_flight.wire import GROUND, Wire
 
 STATES = dict.fromkeys(["x", "y", "z", "yaw"], "")
 
@@ -29,6 +35,7 @@ def test_agents_and_their_links():
     assert read_numbers("0,2,3", 4) == [0, 2, 3]
     usual = ["cflib://radio://0/80/2M/E7E7E7E701", "cflib://radio://0/80/2M/E7E7E7E70B"]
     assert read_links("cflib", [0, 10]) == usual
+    assert read_links("udp", [1, 2]) == ["udp", "udp"]
     assert read_links("udp://a:1,udp://a:2", [1, 2]) == ["udp://a:1", "udp://a:2"]
     for text in ("", "0,0", "0,4", "0;1", "-1"):
         with pytest.raises(FlightError, match="must be different numbers from 0 to 3"):
@@ -189,3 +196,42 @@ def test_each_agent_has_a_thread_and_one_that_fails_ends_alone(monkeypatch):
     for handle in handlers.values():
         handle()
     assert all(each.interrupted for each in agents)
+
+
+@pytest.mark.slow
+def test_one_process_flies_two_agents_and_lands_them(tmp_path):
+    """Over the link to simulated vehicles, in slow motion."""
+    two_points.write(tmp_path)
+    mission, key, port = Mission(tmp_path), tmp_path / "key", free_port() // 8 * 8
+    make_key(key)
+    start = [sys.executable, "-m", "echelon_flight", tmp_path]
+    speed, link = ["--speed", "0.5"], f"udp://127.0.0.1:{port + 4}"
+    vehicles = subprocess.Popen([*start, "--vehicles", *speed, "--port", str(port + 4)])
+    ports, heard = ports_of(2, port), {0: [], 1: []}
+    wire = mission.wire(GROUND, key)
+    # It hears the agents, and they hear each other through memory alone.
+    ground = Ground(
+        DatagramSocket(ports[2], ports[:2]), wire, 2, lambda k, report: heard[k].append(report)
+    )
+    ground.listen()
+    words = [*start, "--agents", "0,1", "--key", key, "--link", f"{link},{link}", *speed]
+    words += ["--port", str(port), "--seconds", "3"]
+    try:
+        assert subprocess.run([*words, "--dry-run"], capture_output=True, check=True).stdout == (
+            b"agent 0: all checks passed; nothing was sent to other agents.\n"
+            b"agent 1: all checks passed; nothing was sent to other agents.\n"
+        )
+        agents = subprocess.Popen(words)
+        while not ground.ready:
+            assert agents.poll() is None
+            time.sleep(0.02)
+        ground.start(time.time() + 0.5)
+        assert agents.wait() == 0
+    finally:
+        vehicles.kill()
+        vehicles.wait()
+        ground.close()
+    # Agent 1 follows a leader whose letters it has, and both end with the plan.
+    flown = [report for report in heard[1] if report.mode == 1 and report.time > 0.5]
+    assert flown and all(report.leader == 0 and report.heard < 1.0 for report in flown)
+    assert {*ground.faults.values()} == {Fault.END}

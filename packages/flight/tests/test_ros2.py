@@ -16,9 +16,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cyclonedds.domain import DomainParticipant
+from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
-from ros2_node import Pose, numbers
+from ros2_node import Full, Header, Place, Point, Pose, Stamp, Turn, numbers
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from echelon_flight import FlightError, MissingLibraryError
@@ -229,11 +230,29 @@ def test_a_crazyflie_of_crazyswarm2_is_read_and_obeys():
         link.close()
     assert end["p"] == pytest.approx([0.3, -0.2, 1.1], abs=0.02)
     place, turn, motion = end["last"][:3], end["last"][3:7], end["last"][7:]
-    assert (
-        place[:2] == pytest.approx(reading.x[:2]) and place[2] < reading.x[2]
-    )
+    assert place[:2] == pytest.approx(reading.x[:2]) and place[2] < reading.x[2]
     assert turn == pytest.approx([0.0, 0.0, math.sin(0.25), math.cos(0.25)])
     assert motion == [0.0, 0.0, -0.3, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+
+
+def test_poses_that_are_none_are_left_out_or_refused():
+    """By a participant of this process, whose messages a test chooses."""
+    world = DomainParticipant(0)
+    topic, inputs = Topic(world, "rt/cf3/pose", Pose), Topic(world, "rt/cf3/cmd_full_state", Full)
+    out, _reader = DataWriter(world, topic), DataReader(world, inputs)
+    link = open_link("ros2://cf3", facts(*DOUBLE))
+
+    def said(k, x=1.0, w=1.0):
+        place = Place(Point(x, 2.0, 3.0), Turn(0.0, 0.0, 0.0, w))
+        out.write(Pose(Header(Stamp(k, 0), "world"), place))
+        return link.read(5.0)
+
+    assert [said(k) is None for k in range(1, 6)] == [True] * 4 + [False]
+    assert said(6, x=math.nan) is None and said(7, w=math.nan) is None
+    assert said(5) is None and said(8).x == [1.0, 2.0, 3.0, 0.0, 0.0, 0.0]
+    with pytest.raises(FlightError, match="the orientation on `/cf3/pose` has length 0, and must"):
+        said(9, w=0.0)
+    link.close()
 
 
 def test_a_ground_robot_with_odometry_is_read_and_obeys():

@@ -48,16 +48,16 @@ def read_numbers(text: str, agents: int) -> list[int]:
 
 
 def read_links(text: str, numbers: Sequence[int]) -> list[str]:
-    """Return the link of each agent: `--link` has one for each, or `cflib` for the usual addresses.
+    """Return the link of each agent: `--link` has one for each, or a scheme alone for all.
 
-    These are those that `echelon path --all` writes: agent 0 has `E7E7E7E701`.
+    The addresses of `cflib` are those that `echelon path --all` writes: agent 0 has `E7E7E7E701`.
 
     Raises:
         FlightError: there is another number of links, or they are on several dongles.
     """
     if text == "cflib":
         return [f"cflib://radio://0/80/2M/E7E7E7E7{k + 1:02X}" for k in numbers]
-    links = text.split(",")
+    links = text.split(",") if "://" in text else [text] * len(numbers)
     if len(links) != len(numbers):
         raise FlightError(
             f"`--link` has {len(links)} addresses, and `--agents` {len(numbers)}; give one for "

@@ -134,8 +134,11 @@ class Ros2Link(Link):
             return None
         now, header = time.monotonic(), message.header.stamp
         pose = message.pose if self._address.state == "pose" else message.pose.pose
-        place = pose.position.x, pose.position.y, pose.position.z
-        q = self._unit(pose.orientation)
+        place, q = (pose.position.x, pose.position.y, pose.position.z), pose.orientation
+        # Motion capture says NaN of a body that it does not see.
+        if not all(map(math.isfinite, (*place, q.w, q.x, q.y, q.z))):
+            return None
+        q = self._unit(q)
         if self._address.state == "odom":
             twist = message.twist.twist
             body = twist.angular.x, twist.angular.y, twist.angular.z
