@@ -271,6 +271,12 @@ def test_every_command_that_shows_a_run_shows_a_flight(flight, echelon, tmp_path
         assert echelon("export", flight, "--out", tmp_path / name)[0] == 0
     rows = (tmp_path / "run.csv").read_text().splitlines()
     result = ech.load(flight)
+    for words in (("--out", tmp_path / "x.mcap"), ("--to", "rosbag2", "--out", tmp_path / "bag")):
+        assert echelon("export", flight, *words)[0] == 0
+        bag = ech.load(words[-1], agents={k: f"/agent{k}/odom" for k in range(N)})
+        assert bag.times == pytest.approx(result.times, abs=1e-9)
+        names = [bag.state_names.index(name) for name in ("x", "y", "vx", "vy")]
+        assert bag.states[:, :, names] == pytest.approx(result.states, abs=1e-9)
     assert len(rows) == 1 + N * len(result.times)
     again = ech.load(tmp_path / "run.nc")
     assert np.array_equal(again.states, result.states)

@@ -12,7 +12,7 @@ from types import ModuleType
 from typing import Any, Final, NamedTuple, final
 
 from echelon_flight import FlightError
-from echelon_flight.datagram_socket import DatagramSocket
+from echelon_flight.datagram_socket import Datagrams
 from echelon_flight.flight_log import FlightLog, Tick
 from echelon_flight.links import Link, Reading
 from echelon_flight.parameters import values_of
@@ -94,7 +94,7 @@ class AgentContext(NamedTuple):
     facts: Mapping[str, Any]
     flight: Mapping[str, Any]
     link: Link
-    socket: DatagramSocket
+    socket: Datagrams
     wire: Wire
     clock: PlanClock
     log: FlightLog | None = None
@@ -268,6 +268,8 @@ class AgentProcess:
             self.context.link.send(u)
         except FlightError as error:
             self._fail(error)
+        if self.context.link.notice:
+            self._say(self.context.link.notice)
         # At the network's rate, whatever the ticks that were skipped.
         due = math.floor(t / self.context.facts["network"]["period"] + 1e-6)
         said = letter is not None and due > self._sent
@@ -287,6 +289,8 @@ class AgentProcess:
         try:
             if self._ticked >= 0.0:
                 self.context.link.level_descend()
+            if self.context.link.notice:
+                self._say(self.context.link.notice)
         except FlightError as error:
             self._fail(error)
 

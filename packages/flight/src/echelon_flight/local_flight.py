@@ -5,7 +5,7 @@ import math
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self, final
 
@@ -27,6 +27,7 @@ class LocalFlight:
         port: of agent 0 on 127.0.0.1; the others have the next ones, then come the ground station,
             the bridge, and the vehicles.
         vehicles: the command of another simulation of the vehicles.
+        watch: called with the number of an agent and each of its reports.
 
     Attributes:
         ground: the ground station.
@@ -39,10 +40,11 @@ class LocalFlight:
         speed: float,
         port: int,
         vehicles: Sequence[str] = (),
+        watch: Callable[[int, Report], None] = lambda number, report: None,
     ) -> None:
         """Start the vehicles and the network."""
         self._mission, self._seconds, self._speed = mission, seconds, speed
-        self._key, self._others = mission.folder / "key", vehicles
+        self._key, self._others, self._watch = mission.folder / "key", vehicles, watch
         make_key(self._key)
         self._ports = ports_of(mission.agents, port)
         self._bridge, self._plant = (port + mission.agents + k for k in (1, 2))
@@ -61,6 +63,7 @@ class LocalFlight:
         return [address for k, address in enumerate(self._ports) if k != own]
 
     def _note(self, number: int, report: Report) -> None:
+        self._watch(number, report)
         if math.isfinite(report.x) and number in self._began:
             self.ready.setdefault(number, time.monotonic() - self._began[number])
 

@@ -134,7 +134,7 @@ def _logs(files: Sequence[Path], facts: JsonObject, root: Path) -> tuple[list[Lo
     return logs, warnings
 
 
-class Track(NamedTuple):
+class FlownTrack(NamedTuple):
     """What K ticks of one agent's law say, of all its processes in the order of time.
 
     Attributes:
@@ -157,7 +157,7 @@ class Track(NamedTuple):
     last: Tick | None
 
 
-def _track(logs: Sequence[LogFile], n: int, m: int, angles: Sequence[int]) -> Track:
+def _track(logs: Sequence[LogFile], n: int, m: int, angles: Sequence[int]) -> FlownTrack:
     every = [tick for log in sorted(logs, key=lambda x: x.header["boot"]) for tick in log.ticks]
     ticks = [tick for tick in every if tick.mode == 1 and np.isfinite(tick.u).all()]
     heard = dict[int, list[tuple[float, float]]]()
@@ -165,7 +165,7 @@ def _track(logs: Sequence[LogFile], n: int, m: int, angles: Sequence[int]) -> Tr
         heard.setdefault(letter.sender, []).append((letter.arrived, letter.row[0]))
     x = np.array([tick.x for tick in ticks], float).reshape(-1, n)
     x[:, angles] = np.unwrap(x[:, angles], axis=0)
-    return Track(
+    return FlownTrack(
         times=np.array([tick.time for tick in ticks], float),
         x=x,
         u=np.array([tick.u for tick in ticks], float).reshape(-1, m),

@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
+from typing import overload
 
 from echelon.core.errors import Outcome, OutputError
 from echelon.core.files import INPUTS, write_atomic
@@ -34,6 +35,7 @@ from echelon.output.archive.folder import (
     claim_folder,
     write_errors,
 )
+from echelon.output.archive.recorded import Recorded, recorded
 from echelon.output.reports.run_report import report
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
@@ -104,8 +106,16 @@ def write_findings(result: Result, folder: Path, figures: bool = True) -> None:
             save_figures(recording(data.arrays(), data.attributes), folder)
 
 
-def load(place: PathLike, parts: Parts | None = None) -> Result:
-    """Return the run in a folder, or in its `run.nc`, whatever its state; or a flight.
+@overload
+def load(place: PathLike, parts: Parts | None = None, agents: None = None) -> Result: ...
+@overload
+def load(place: PathLike, parts: None = None, *, agents: Mapping[int, str]) -> Recorded: ...
+
+
+def load(
+    place: PathLike, parts: Parts | None = None, agents: Mapping[int, str] | None = None
+) -> Result | Recorded:
+    """Return a run, whatever its state; or a flight, or what others recorded.
 
     Of a run that was stopped or killed, or is still computed, it is what is stored. States and all
     else in `run.nc` are read without executing code; `parts` and what needs them (such as `report`,
@@ -114,12 +124,18 @@ def load(place: PathLike, parts: Parts | None = None) -> Result:
 
     Args:
         place: the folder of a run, or a netCDF file such as its `run.nc`; the folder of a flight,
-            or that of one of its flights in `logs`, whose agents' logs are joined.
+            or that of one of its flights in `logs`, whose agents' logs are joined; with `agents` a
+            bag of ROS 2 (folder, `.mcap`, `.db3`), a ULog (`.ulg`) or a Crazyflie's log (`.csv`).
         parts: those of a run that was made in Python, which no file contains.
+        agents: the topic of each agent in a recording of others: PoseStamped or Odometry in a bag,
+            `vehicle_odometry` or `vehicle_local_position` in a ULog, `stateEstimate` in a log. The
+            result then has `times` (T,), `states` (T, N, n), `state_names`, and `tracks`.
 
     Raises:
         OutputError: there is no run, it is damaged, or of a format that is not read. Also raised
             when `parts` are first read, if there is no scenario or it was changed since the run.
+            A recording lacks a topic.
+        MissingExtraError: a recording needs a library that is not installed.
         ScenarioError: the scenario of a killed run cannot be read.
     """
     if not isinstance(place, str | os.PathLike):
@@ -127,6 +143,8 @@ def load(place: PathLike, parts: Parts | None = None) -> Result:
             f"`place` is {place!r}, and must be the folder of a run, or its `{DATA}`."
         )
     path = check_exists(Path(place))
+    if agents is not None:
+        return recorded(path, agents)
     if path.is_file():
         return _stored(path, read_recording(path)[1], parts)
     if root_of(path) is not None:
