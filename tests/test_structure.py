@@ -212,16 +212,19 @@ def test_flight_needs_the_standard_library_alone():
     pairs = {(m.rpartition(".")[2], name.split(".")[0]) for m, name in flight}
     own = {"echelon_flight", *sys.stdlib_module_names}
     found = {each for each in pairs if each[1] not in own}
-    assert found == {("crazyflie", "cflib"), ("px4", "pymavlink")}
+    dds = {(module, "cyclonedds") for module in ("ros2", "ros2_messages")}
+    assert found == {("crazyflie", "cflib"), ("px4", "pymavlink"), *dds}
 
 
-def test_echelon_knows_four_names_of_flight_and_its_version():
+def test_echelon_knows_few_names_of_flight_and_its_version():
     flight = importlib.import_module("echelon_flight")
     names = {name for _, name in imported() if package_of(name) == flight.__name__}
     found = {name.removeprefix(f"{flight.__name__}.") for name in names}
     assert found == {
         *("FlightError", "__version__"),
-        *("mission.check_options", "page_server.Handler"),
+        *("mission.check_options", "page_server.Handler", "parameters.DEFAULTS"),
+        *("flight_log.LogFile", "flight_log.Tick", "flight_log.find_logs", "flight_log.read_log"),
+        "supervisor.Fault",
     }
     assert flight.__version__ == CONTAINED
 
@@ -371,8 +374,8 @@ def test_every_dependency_is_pinned_imported_or_has_its_reason():
     assert required - pinned == {project()["name"]}
     assert "://" not in text and "\n-" not in text
     optional = (
-        *("certify", "cluster", "control", "crazyflie", "fast"),
-        *("optimal", "parquet", "px4", "video"),
+        *("bags", "certify", "cluster", "control", "crazyflie", "fast"),
+        *("optimal", "parquet", "px4", "ros2", "video"),
     )
     names = [*project()["dependencies"], *itertools.chain(*(extras[name] for name in optional))]
     used = {name.split(".")[0] for _, name in imported() | imported("echelon_flight")}

@@ -22,7 +22,7 @@ json.dump(said, sys.stdout)
 PORT = "`--port` is {}, and must be from 0 to 65535."
 GONE = "`gone` does not exist; give the folder of a run, or its `run.nc`."
 SCENARIO = "`wrong.yaml` is a scenario; run it first (`echelon run wrong.yaml --out FOLDER`), and"
-KINDS = "`csv`, `parquet`, `npz`, `mat`, `nc`, `html`"
+KINDS = "`csv`, `parquet`, `npz`, `mat`, `nc`, `html`, `mcap`"
 
 
 REFUSED = [

@@ -49,10 +49,10 @@ def test_a_folder_is_prepared_and_flown_by_another_program(echelon, here, taken_
 
 
 REFUSED = {
-    "": "give one of `--agent` with a number, `--all`, `--ground` and `--out`.",
+    "": "give one of `--agent` with a number, `--agents`, `--all`, `--ground` and `--out`.",
     "--agent 0": "give `--key` with the key file, which all agents and the ground share.",
     "--ground --key none": "the key file `none` cannot be read",
-    "--all --link radio://0": "`--link` is `radio://0`, and must begin with `udp`, `cflib`, `px4`.",
+    "--all --link radio://0": "`--link` is `radio://0`, and must begin with `udp`, `cflib`, `px4`",
 }
 
 

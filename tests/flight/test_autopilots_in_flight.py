@@ -70,8 +70,8 @@ def served(script, **settings):
 
 
 @contextlib.contextmanager
-def started(folder, model, laws, links, port):
-    """Start a formation by `echelon fly`, a process an agent.
+def started(folder, model, laws, links, port, together=False):
+    """Start a formation by `echelon fly`, a process an agent, or one process for all.
 
     Yields the ground station, the processes, and when the plan began.
     """
@@ -84,10 +84,12 @@ def started(folder, model, laws, links, port):
     command = [sys.executable, "-m", "echelon_flight", folder, "--key", key, "--port", str(port)]
     command += ["--speed", str(SPEED)]
     flying = []
-    for k, link in enumerate(links):
+    each = [["--agent", str(k), "--link", link] for k, link in enumerate(links)]
+    if together:
+        each = [["--agents", ",".join(map(str, range(len(links)))), "--link", ",".join(links)]]
+    for k, words in enumerate(each):
         with (folder / f"said-{k}").open("w") as said:
-            words = [*command, "--agent", str(k), "--link", link]
-            flying.append(subprocess.Popen(words, stderr=said))
+            flying.append(subprocess.Popen([*command, *words], stderr=said))
     try:
         until = time.monotonic() + 30.0
         while not ground.ready:
@@ -168,6 +170,26 @@ def test_four_processes_fly_a_formation_and_land(tmp_path, name, vehicle, laws, 
     say(capsys, f"four processes, {name}, {vehicle}, {laws.__name__}", beside, leader)
     assert beside <= most and leader <= 0.05
     assert np.load(file)["places"][-1, :, 2].max() < 0.06
+
+
+def test_one_process_flies_four_on_a_dongle_that_carries_300_setpoints(tmp_path, capsys):
+    extra("cflib.crtp", "crazyflie")
+    file, model, folder = str(tmp_path / "flown.npz"), CrazyflieAttitude(), tmp_path / "flight"
+    with served(
+        "fake_crazyflie.py", port=19960, starts=starts(), file=file, carried=300.0
+    ) as radio:
+        links = [f"cflib://udp://127.0.0.1:{19960 + k}" for k in range(4)]
+        flight = started(folder, model, consensus, links, 52300, together=True)
+        with flight as (_, flying, begin):
+            assert [one.wait(SECONDS / SPEED + 30.0) for one in flying] == [0]
+        radio.stdin.close()
+        carried, dropped = map(int, radio.stdout.readline().split())
+    said = (folder / "said-0").read_text()
+    assert said.count("setpoints are late: the dongle carries 300 a second for 4 vehicles.") == 4
+    assert said.count(" setpoints were late.") == 4
+    beside, leader = errors(file, begin)
+    say(capsys, f"one process, one dongle ({dropped} of {carried + dropped} lost)", beside, leader)
+    assert beside <= 0.015 and leader <= 0.05 and dropped < 0.01 * carried
 
 
 # A cut in s of the plan; 0: the vehicle's program is killed.

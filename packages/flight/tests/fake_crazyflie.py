@@ -40,6 +40,28 @@ def packed(q):
     return bits
 
 
+class Dongle:
+    """A radio of several vehicles, which drops setpoints beyond so many a second in all.
+
+    Attributes:
+        carried, dropped: how many.
+    """
+
+    def __init__(self, most=300.0, burst=16.0):
+        self.most, self.burst, self.credit, self.at = most, burst, burst, None
+        self.carried = self.dropped = 0
+
+    def carries(self, packet, now):
+        if packet[0] >> 4 not in (3, 7):
+            return True
+        gone = 0.0 if self.at is None else now - self.at
+        self.credit, self.at = min(self.burst, self.credit + self.most * gone), now
+        passes = self.credit >= 1.0
+        self.credit -= passes
+        self.carried, self.dropped = self.carried + passes, self.dropped + (not passes)
+        return passes
+
+
 class Crazyflie:
     """Answers packets: a header byte, then at most 30 bytes.
 
@@ -51,7 +73,7 @@ class Crazyflie:
     def __init__(self, full=FULL):
         self.full, self.command, self.heard = full, [0.0] * 4, -math.inf
         self.parameters, self.blocks, self.locked = dict(PARAMETERS), {}, True
-        self.acceleration = None
+        self.acceleration = self.place = None
 
     def answer(self, packet, now):
         port, channel, data = packet[0] >> 4, packet[0] & 3, packet[1:]
@@ -128,6 +150,9 @@ class Crazyflie:
         if channel == 0 and data[0] == 6:
             numbers = struct.unpack("<hhhhhhhhhIhhh", data[1:])
             self.acceleration, self.heard = [1e-3 * a for a in numbers[6:9]], now
+        if channel == 0 and data[0] == 7:
+            *self.place, yaw = struct.unpack("<ffff", data[1:])
+            self.heard = now
         if channel == 0 and data[0] == 0:
             self.command, self.heard = [0.0] * 4, now
         return []
@@ -135,6 +160,17 @@ class Crazyflie:
     def take(self, roll, pitch, rate, thrust, now):
         tilt = [math.radians(angle) for angle in (roll, pitch, rate)]
         self.command, self.heard = [*tilt, thrust / 65535.0 * self.full], now
+        self.place = None
+
+    def hold(self, p, v, mass):
+        """Command what moves it to the place of its last setpoint, heading east."""
+        if self.place is None:
+            return
+        ax, ay, az = (
+            max(-3.0, min(3.0, 4.0 * (goal - x) - 3.0 * s))
+            for goal, x, s in zip(self.place, p, v, strict=True)
+        )
+        self.command = [-ay / 9.81, ax / 9.81, 0.0, mass * (9.81 + az)]
 
     def acting(self, now):
         """The command that acts: level 0.5 s after the last, and none 2 s after it."""
@@ -160,7 +196,7 @@ class Crazyflie:
 
 def serve(
     port, starts, file, mass=0.0319, gain=0.97605781, lag=0.0, response=None, speed=1.0,
-    controller=None,
+    controller=None, carried=None,
 ):  # fmt: skip
     """Serve vehicles until the standard input ends; in slow motion with a speed below 1."""
     vehicles = Vehicles(starts, mass, gain, lag, controller=controller, **(response or IDENTIFIED))
@@ -169,7 +205,7 @@ def serve(
         end.bind(("127.0.0.1", port + k))
         end.setblocking(False)
     crazyflies, peers = [Crazyflie() for _ in starts], [None] * len(starts)
-    radio = Radio(len(starts))
+    radio, dongle = Radio(len(starts)), Dongle(speed * carried) if carried else None
     flown, dt, real, begun, steps = Recorder(), 0.002, 0.002 / speed, time.monotonic(), 0
     print("ready", flush=True)
     while True:
@@ -188,9 +224,13 @@ def serve(
             if not radio.open(k, now):
                 continue
             peers[k] = peer
+            if dongle is not None and not dongle.carries(packet, now):
+                continue
             for answer in crazyflies[k].answer(packet, speed * now):
                 end.sendto(answer, peers[k])
         while begun + steps * real <= now:
+            for each, p, v in zip(crazyflies, vehicles.p, vehicles.v, strict=True):
+                each.hold(p, v, mass)
             vehicles.command = np.array([each.acting(speed * now) for each in crazyflies])
             vehicles.step(dt)
             steps += 1
@@ -201,6 +241,8 @@ def serve(
                 if peers[k] and radio.open(k, now):
                     sockets[k].sendto(packet, peers[k])
     flown.save(file)
+    if dongle is not None:
+        print(dongle.carried, dongle.dropped, flush=True)
 
 
 if __name__ == "__main__":

@@ -152,7 +152,7 @@ def test_a_clock_that_is_off_keeps_a_vehicle_on_the_ground(why, scene, capsys):
 
 def test_a_neighbour_whose_clock_is_ahead_is_told(scene, capsys):
     scene.start()
-    for off, why in ((1.5, "that differs from this clock by"), (0.2, "ahead of this clock")):
+    for off, why in ((1.5, "that is farther from this clock than"), (0.2, "ahead of this clock")):
         t = scene.context.clock.now + off
         scene.air.send(scene.leader.letter(letter(0, t)))
         scene.rounds(2)

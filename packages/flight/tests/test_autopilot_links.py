@@ -1,19 +1,19 @@
 """Links to autopilots without their libraries: what they send and read, and what they refuse."""
 
 import math
-import struct
 import sys
 import time
 from types import ModuleType, SimpleNamespace
 
 import pytest
-from fake_crazyflie import Crazyflie, packed
+from cflib_stub import LogConfig, Stub
 
 from echelon_flight import FlightError, MissingLibraryError
 from echelon_flight import __main__ as process
 from echelon_flight.links import open_link
 from echelon_flight.links.crazyflie import CflibLink
 from echelon_flight.links.px4 import Px4Link
+from echelon_flight.parameters import DEFAULTS
 
 STATES = dict.fromkeys(["x", "y", "z", "vx", "vy", "vz", "roll", "pitch", "yaw"], "")
 COMMANDS = ("roll_command", "pitch_command", "yaw_rate_command", "thrust")
@@ -25,72 +25,6 @@ def facts(*inputs):
         "agent": 0, "dt": 0.01, "states": STATES, "inputs": dict.fromkeys(names, ""),
         "trim": dict.fromkeys(names, 0.0) | {"thrust": 0.3},
     }  # fmt: skip
-
-
-class Commander:
-    """Writes packets as cflib 0.1.34 does, for the fake."""
-
-    def __init__(self, fake):
-        self.fake, self.now = fake, 0.0
-
-    def send_setpoint(self, roll, pitch, rate, thrust):
-        self.fake.answer(b"\x3c" + struct.pack("<fffH", roll, -pitch, rate, thrust), self.now)
-
-    def send_setpoint_manual(self, roll, pitch, rate, percent, rates):
-        thrust = int(10001 + 0.01 * percent * (60000 - 10001))
-        data = struct.pack("<BfffHB", 11, roll, -pitch, rate, thrust, rates)
-        self.fake.answer(b"\x7c" + data, self.now)
-
-    def send_full_state_setpoint(self, place, speed, acceleration, q, *rates):
-        numbers = [int(1000 * number) for number in (*place, *speed, *acceleration)]
-        turn = [int(1000 * rate) for rate in rates]
-        data = struct.pack("<BhhhhhhhhhIhhh", 6, *numbers, packed(q), *turn)
-        self.fake.answer(b"\x7c" + data, self.now)
-
-    def send_stop_setpoint(self):
-        self.fake.answer(b"\x7c\x00", self.now)
-
-
-class Callbacks(list):
-    add_callback = list.append
-
-
-class LogConfig:
-    def __init__(self, name, period_in_ms):
-        assert period_in_ms == 10
-        self.variables, self.data_received_cb = {}, Callbacks()
-
-    def add_variable(self, name, kind):
-        self.variables[name] = kind
-
-    def start(self):
-        assert sum({"i": 2, "u": 4, "F": 2}[kind[0]] for kind in self.variables.values()) <= 26
-
-
-class Stub:
-    """What the link uses of cflib's `Crazyflie`, with the fake behind it."""
-
-    def __init__(self):
-        self.fake, self.configs, self.armed = Crazyflie(), [], []
-        self.commander, self.connection_lost = Commander(self.fake), Callbacks()
-        self.confirm = Callbacks()
-        self.param = SimpleNamespace(
-            set_value=self.set_value,
-            add_update_callback=lambda group, name, cb: self.confirm.append(cb),
-        )
-        self.log = SimpleNamespace(add_config=self.configs.append)
-        self.supervisor = SimpleNamespace(send_arming_request=self.armed.append)
-
-    def set_value(self, name, value):
-        self.fake.parameters[name] = value
-        for call in self.confirm:
-            call(name, str(value))
-
-    def arrive(self, **values):
-        names = self.configs[0].variables
-        packet = {name: values.get(name.partition(".")[2], 0) for name in names}
-        for call in self.configs[0].data_received_cb:
-            call(0, packet | {"stateEstimateZ.quat": 3 << 30}, None)
 
 
 @pytest.fixture
@@ -114,11 +48,10 @@ def test_attitudes_reach_the_crazyflie_with_the_signs_of_echelon(crazyflie):
     assert crazyflie.fake.command[3] == pytest.approx(0.5, abs=6e-6)
 
 
-def test_a_crazyflie_that_keeps_another_controller_is_refused(crazyflie, monkeypatch):
-    monkeypatch.setattr("echelon_flight.links.crazyflie._PATIENCE", 0.01)
+def test_a_crazyflie_that_keeps_another_controller_is_refused(crazyflie):
     crazyflie.param.set_value = lambda *_: None
     with pytest.raises(FlightError, match="does not confirm its parameter `stabilizer.controller`"):
-        CflibLink("", facts(), crazyflie)
+        CflibLink("", facts() | {"parameters": DEFAULTS | {"cflib_patience": 0.01}}, crazyflie)
 
 
 def test_the_newest_state_is_read_once(crazyflie):
@@ -161,6 +94,35 @@ def test_a_descent_is_level_and_ends_with_the_motors_off_at_the_ground_or_in_tim
         monkeypatch.setattr(time, "monotonic", lambda later=later: now + later)
         blind.level_descend()
         assert crazyflie.fake.command[3] == pytest.approx(thrust, abs=4e-6)
+
+
+def test_the_numbers_of_a_flight_reach_a_crazyflie(crazyflie, monkeypatch):
+    numbers = {"sinking_thrust": 0.8, "sinking_time": 2.0, "landed_height": 0.2}
+    numbers |= {"position_age": 1.0, "empty_battery": 3.5, "full_battery": 3.9}
+    link = CflibLink("", facts() | {"parameters": DEFAULTS | numbers}, crazyflie)
+    crazyflie.arrive(z=500, vbat=3.6)
+    assert link.read(0.0).battery == pytest.approx(0.25)
+    now, thrust = time.monotonic(), 0.8 * 0.3
+    for later, z, wanted in ((0.0, 500, thrust), (1.9, 210, thrust), (1.95, 190, 0.0)):
+        monkeypatch.setattr(time, "monotonic", lambda later=later: now + later)
+        crazyflie.arrive(z=z)
+        link.send([0.0, 0.0, 0.0, 0.25])
+        link.level_descend()
+        assert crazyflie.fake.command[3] == pytest.approx(wanted, abs=4e-6)
+    high = CflibLink("", facts() | {"parameters": DEFAULTS | numbers}, crazyflie)
+    for later, wanted in ((10.0, thrust), (11.9, thrust), (12.1, 0.0)):
+        monkeypatch.setattr(time, "monotonic", lambda later=later: now + later)
+        high.level_descend()
+        assert crazyflie.fake.command[3] == pytest.approx(wanted, abs=4e-6)
+    crazyflie.extpos = SimpleNamespace(send_extpos=lambda *place: None)
+    link.locate((0.0, 0.0, 0.5))
+    for later, fails in ((12.9, False), (13.2, True)):
+        monkeypatch.setattr(time, "monotonic", lambda later=later: now + later)
+        if fails:
+            with pytest.raises(FlightError, match="no position came from outside for 1 s"):
+                link.read(0.0)
+        else:
+            link.read(0.0)
 
 
 REFUSED = {

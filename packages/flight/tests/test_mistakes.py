@@ -90,7 +90,7 @@ def unlike(flight, tmp_path, why):
     [
         "is signed with another key",
         "is of another formation",
-        "has a time stamp that differs from this clock by more than 1 s",
+        "has a time stamp that is farther from this clock than `stamp_difference` allows",
     ],
 )
 def test_an_agent_that_is_unlike_the_others_stays_on_the_ground(flight, tmp_path, why, capsys):
@@ -120,7 +120,7 @@ def test_a_law_that_overruns_its_period(flight, capsys):
     flight.start_agent(0)
     flight.start_agent(1, law=types.SimpleNamespace(**vars(law) | {"step": step}))
     flight.take_off(0, 1)
-    sentence = "of its period, more than half"
+    sentence = "of its period, more than `overrun_share` allows"
     flight.wait(lambda state: sentence in (state["agents"][1].get("why") or ""), 4.0)
     # The other one flies on and ends as planned.
     assert row(flight, 0)["mode"] == "flies"
@@ -139,7 +139,7 @@ def test_a_link_with_another_step_than_the_law(flight, step):
     flight.take_off(0, 1)
     told = f"states arrive every {step:g} s, and the law's period is {two_points.DT:g} s"
     if step >= 2.0 * two_points.DT:
-        told = f"states arrive every {step:g} s, at least twice the law's period"
+        told = f"states arrive every {step:g} s, too slowly for the law (`slow_states`)"
         flight.wait(lambda state: all(each.get("why") == told for each in state["agents"]))
         flight.wait(lambda state: len(flight.ended) == 2)
         assert set(flight.ended.values()) == {Fault.PERIOD}

@@ -129,20 +129,26 @@ class VirtualFlight:
         wire = self.mission.wire(GROUND, key)
         self.ground = Ground(self.network.socket(), wire, self.mission.agents)
 
-    def start_agent(self, number, mission=None, key=None, skew=0.0, name=None, law=None):
+    def start_agent(
+        self, number, mission=None, key=None, skew=0.0, name=None, law=None, logs=False
+    ):
         name, self.clock.skew = number if name is None else name, skew
         mission = mission or self.mission
         module, facts = mission.law(number)
         link = VehicleLink(self.vehicles[number], self.clock)
         wire = mission.wire(number, key or self.key)
         rest = link, self.network.socket(), wire, PlanClock()
-        context = AgentContext(law or module, facts, mission.facts, *rest)
+        log = mission.log(facts, "virtual") if logs else None
+        context = AgentContext(law or module, facts, mission.facts, *rest, log)
         self.agents[name] = AgentProcess(context, mission.facts["horizon"])
         self._skews[name], self._links[name] = skew, link
         self.clock.skew = 0.0
 
     def kill(self, name):
-        self.agents.pop(name).context.socket.close()
+        agent = self.agents.pop(name)
+        agent.context.socket.close()
+        if agent.context.log is not None:
+            agent.context.log.close()
 
     def take_off(self, *ready):
         """Start the plan once some agents are ready, in all of which that is so soon."""

@@ -6,6 +6,7 @@ import math
 import signal
 import sys
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from echelon_flight import FlightError, __version__
@@ -22,9 +23,7 @@ from echelon_flight.datagram_socket import (
 from echelon_flight.links import Link, open_link
 from echelon_flight.mission import Mission
 from echelon_flight.supervisor import Fault
-from echelon_flight.wire import GROUND
-
-_READY = 5.0  # s, within which a state of the vehicle must arrive
+from echelon_flight.wire import GROUND, Report
 
 
 def main() -> None:
@@ -46,10 +45,13 @@ def _options() -> argparse.Namespace:
     say("--version", action="version", version=f"echelon-flight {__version__}")
     say("folder", type=Path, help="a folder that `echelon fly --out` wrote")
     say("--agent", type=int, help="fly this agent")
+    say("--agents", help="fly these agents, such as 0,1,2, by one process and one dongle")
     say("--all", action="store_true", help="fly all, with simulated vehicles")
     say("--ground", action="store_true", help="serve the page of the ground station")
+    say("--ros2", action="store_true", help="publish poses, goals and markers to ROS 2")
     say("--dry-run", action="store_true", help="check everything, and send nothing to others")
-    say("--link", default="udp", help="to the vehicle: udp, cflib://.. or px4://..")
+    say("--link", default="udp", help="to the vehicle: udp, cflib://.., px4://.. or ros2://..")
+    say("--positions", type=Path, help="a Python file whose class `Positions` yields positions")
     say("--key", type=Path, help="the key file of the formation")
     say("--listen", help="address and port to hear others at")
     say("--to", help="addresses and ports of others, separated by commas")
@@ -72,6 +74,8 @@ def _run(mission: Mission, options: argparse.Namespace) -> int:
     if options.seconds is not None and not options.seconds > 0.0:
         raise FlightError(f"`--seconds` is {options.seconds:g}, and must be above 0.")
     # Imported where they are used: an agent's process stays small.
+    if options.ros2 and not (options.ground or options.all):
+        raise FlightError("`--ros2` is for the ground station: give it with `--ground` or `--all`.")
     if options.vehicles:
         from echelon_flight.simulated_vehicles import Vehicles, simulated
 
@@ -85,8 +89,10 @@ def _run(mission: Mission, options: argparse.Namespace) -> int:
         return _fly_all(mission, options)
     if options.ground:
         return _watch(mission, options)
+    if options.agents is not None:
+        return _fly_several(mission, options)
     if options.agent is None:
-        raise FlightError("give `--agent` with a number, `--all` or `--ground`.")
+        raise FlightError("give `--agent` with a number, `--agents`, `--all` or `--ground`.")
     return _fly(mission, options)
 
 
@@ -104,44 +110,102 @@ def _ways(
 
 def _fly(mission: Mission, options: argparse.Namespace) -> int:
     """Fly one agent."""
-    wire = mission.wire(options.agent, options.key)
-    listen, to = _ways(mission, options.agent, options)
+    context = _context(mission, options, options.agent, options.link)
+    _forward(mission, options, [context])
+    if options.dry_run:
+        _check_state(context, options.link, mission.parameters["state_patience"])
+        return 0
+    fault = AgentProcess(context, _seconds(mission, options)).run()
+    return 0 if fault in (Fault.END, Fault.SIGNAL) else 1
+
+
+def _fly_several(mission: Mission, options: argparse.Namespace) -> int:
+    """Fly several agents by this process."""
+    from echelon_flight import one_process
+
+    numbers = one_process.read_numbers(options.agents, mission.agents)
+    links = one_process.read_links(options.link, numbers)
+    direct = [_context(mission, options, k, link) for k, link in zip(numbers, links, strict=True)]
+    contexts = one_process.share(direct)
+    _forward(mission, options, direct)
+    if links[0].startswith("cflib"):
+        carried = mission.parameters["radio_setpoints"]
+        if sentence := one_process.warn(mission.facts["dt"], carried, len(numbers)):
+            print(f"echelon-flight: {sentence}", file=sys.stderr, flush=True)
+    if options.dry_run:
+        for context, link in zip(contexts, links, strict=True):
+            _check_state(context, link, mission.parameters["state_patience"])
+        return 0
+    for context in contexts:
+        context.socket.skip()
+    seconds = _seconds(mission, options)
+    faults = one_process.fly_together([AgentProcess(each, seconds) for each in contexts])
+    return 0 if {*faults} <= {Fault.END, Fault.SIGNAL} else 1
+
+
+def _forward(
+    mission: Mission, options: argparse.Namespace, contexts: Sequence[AgentContext]
+) -> None:
+    """Forward positions from the file that `--positions` names."""
+    if options.positions is None:
+        return
+    from echelon_flight.links.crazyflie import CflibLink
+    from echelon_flight.positions import PositionForwarder, load_positions
+
+    links = {each.wire.number: each.link for each in contexts}
+    known = {k: link for k, link in links.items() if isinstance(link, CflibLink)}
+    if len(known) < len(links):
+        raise FlightError("`--positions` is for the link `cflib`; other vehicles have their own.")
+    source, patience = load_positions(options.positions), mission.parameters["first_position"]
+    PositionForwarder(source, known, patience).start()
+
+
+def _seconds(mission: Mission, options: argparse.Namespace) -> float:
+    return mission.facts["horizon"] if options.seconds is None else options.seconds
+
+
+def _context(
+    mission: Mission, options: argparse.Namespace, number: int, address: str
+) -> AgentContext:
+    """Return what an agent uses, with an open link; tell the ground where that fails."""
+    wire = mission.wire(number, options.key)
+    listen, to = _ways(mission, number, options)
     try:
-        law, facts = mission.law(options.agent)
+        law, facts = mission.law(number)
         socket = DatagramSocket(listen, to, options.interface)
-        link = open_link(options.link, facts)
+        link = open_link(address, facts | {"parameters": mission.parameters})
     except FlightError as error:
         if not options.dry_run:
             tell_once(wire.note(time.time(), str(error).rstrip(".")), to, options.interface)
         raise
     # The start may have been said often while the link was opened.
     socket.skip()
-    if options.dry_run:
-        _wait_for_state(link, options.link)
-        print(f"agent {options.agent}: all checks passed; nothing was sent to other agents.")
-        return 0
-    seconds = mission.facts["horizon"] if options.seconds is None else options.seconds
-    clock = PlanClock(options.speed)
-    context = AgentContext(law, facts, mission.facts, link, socket, wire, clock)
-    fault = AgentProcess(context, seconds).run()
-    return 0 if fault in (Fault.END, Fault.SIGNAL) else 1
+    rest = socket, wire, PlanClock(options.speed), mission.log(facts, address)
+    return AgentContext(law, facts, mission.facts, link, *rest)
 
 
-def _wait_for_state(link: Link, address: str) -> None:
-    """Wait for a state of the vehicle.
+def _check_state(context: AgentContext, address: str, patience: float) -> None:
+    """Wait for a state of the vehicle, and say that all is well."""
+    _wait_for_state(context.link, address, patience)
+    number = context.wire.number
+    print(f"agent {number}: all checks passed; nothing was sent to other agents.")
+
+
+def _wait_for_state(link: Link, address: str, patience: float) -> None:
+    """Wait for a state of the vehicle, some seconds at most.
 
     Raises:
         FlightError: none came.
     """
-    deadline = time.monotonic() + _READY
+    deadline = time.monotonic() + patience
     while time.monotonic() < deadline:
         reading = link.read(0.1)
         if reading is not None and all(map(math.isfinite, reading.x)):
             link.close()
             return
     raise FlightError(
-        f"no state of the vehicle arrived within {_READY:g} s over the link `{address}`; switch it "
-        "on, and check `--link`. To check the flight without vehicles, use `--all --dry-run`."
+        f"no state of the vehicle arrived within {patience:g} s over the link `{address}`; switch "
+        "it on, and check `--link`. To check the flight without vehicles, use `--all --dry-run`."
     )
 
 
@@ -151,7 +215,9 @@ def _watch(mission: Mission, options: argparse.Namespace) -> int:
 
     listen, to = _ways(mission, GROUND, options)
     wire = mission.wire(GROUND, options.key)
-    ground = Ground(DatagramSocket(listen, to, options.interface), wire, mission.agents)
+    socket = DatagramSocket(listen, to, options.interface)
+    view = _view(mission, options)
+    ground = Ground(socket, wire, mission.agents, view, mission.parameters)
     ground.listen()
     with page_of(ground).serving() as address:
         where = f"the ground station is at {address}"
@@ -160,6 +226,15 @@ def _watch(mission: Mission, options: argparse.Namespace) -> int:
             while True:
                 time.sleep(1.0)
     return 0
+
+
+def _view(mission: Mission, options: argparse.Namespace) -> Callable[[int, Report], None]:
+    """Return who takes reports besides the ground station's page."""
+    if not options.ros2:
+        return lambda number, report: None
+    from echelon_flight.ros2_view import Ros2View
+
+    return Ros2View(mission.facts).report
 
 
 def _fly_all(mission: Mission, options: argparse.Namespace) -> int:
@@ -171,7 +246,8 @@ def _fly_all(mission: Mission, options: argparse.Namespace) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     for k in range(mission.agents):
         mission.law(k)
-    flight = LocalFlight(mission, seconds, options.speed, options.port)
+    watch = _view(mission, options)
+    flight = LocalFlight(mission, seconds, options.speed, options.port, watch=watch)
     if options.dry_run:
         print("All checks passed; nothing was started.")
         return 0

@@ -12,8 +12,10 @@ from types import ModuleType
 from typing import Any, Final, NamedTuple, final
 
 from echelon_flight import FlightError
-from echelon_flight.datagram_socket import DatagramSocket
+from echelon_flight.datagram_socket import Datagrams
+from echelon_flight.flight_log import FlightLog, Tick
 from echelon_flight.links import Link, Reading
+from echelon_flight.parameters import values_of
 from echelon_flight.pilot import Pilot
 from echelon_flight.supervisor import Fault, Fence, Supervisor
 from echelon_flight.wire import (
@@ -27,15 +29,8 @@ from echelon_flight.wire import (
     sender_of,
 )
 
-_REPORTS: Final = 0.1  # s between two
-_LONGEST: Final = 20.0  # s of a descent
-_REST: Final = 0.05  # m/s
-_CLOCK: Final = 0.1
-"""s, by which the clock that names the start may be beside this one, without a network's delay."""
 _TWIN: Final = 0.5
 """s after its own beginning from which on nobody else may have its number."""
-_MADE_UP: Final = 5
-"""Ticks that are made up for at most; after a longer gap the law goes on from where it was."""
 _TOLD: Final = (
     *(Drop.VERSION, Drop.FORMATION, Drop.SIGNATURE, Drop.CLOCK, Drop.AHEAD, Drop.START),
     Drop.FLIGHT,
@@ -92,15 +87,17 @@ class AgentContext(NamedTuple):
         socket: to the others.
         wire: that signs for the agent.
         clock: of the plan.
+        log: that is written; None where none is.
     """
 
     law: ModuleType
     facts: Mapping[str, Any]
     flight: Mapping[str, Any]
     link: Link
-    socket: DatagramSocket
+    socket: Datagrams
     wire: Wire
     clock: PlanClock
+    log: FlightLog | None = None
 
 
 @final
@@ -121,12 +118,14 @@ class AgentProcess:
         """Wait for a state and for the start."""
         flight = context.flight
         self.context, self._seconds, self._dt = context, seconds, flight["dt"]
+        self._limits = values_of(flight)
         self.supervisor = Supervisor(flight, Fence(**flight["fence"]))
         leadership = flight["leadership"] or {"backups": ()}
-        self.pilot = Pilot(context.law, context.facts, leadership["backups"])
+        ahead = self._limits["letter_ahead"]
+        self.pilot = Pilot(context.law, context.facts, leadership["backups"], ahead)
         self._reading: Reading | None = None
         self._began, self._ticked, self._fell = time.monotonic(), -math.inf, math.inf
-        self._due = 0.0
+        self._due, self._fault_logged = 0.0, False
         self._sent, self._reported, self._signals = -math.inf, -math.inf, 0
         self._moved = self._heard_at = self._began
         self._said, self._notes = set[str](), deque[str](maxlen=10)
@@ -149,6 +148,8 @@ class AgentProcess:
             with contextlib.suppress(FlightError):
                 self.context.wire.keep()
         self._say(f"{self.supervisor.sentence}; {self._summary()}")
+        if self.context.log is not None:
+            self.context.log.close()
         return self.supervisor.fault
 
     def interrupt(self) -> None:
@@ -164,8 +165,9 @@ class AgentProcess:
         now = time.monotonic()
         self._fell = min(self._fell, now)
         # As far as its states say: one that is not heard may still fly.
-        rests = self._heard_at - self._moved > 1.0 / self.context.clock.speed
-        late = now - self._fell > _LONGEST / self.context.clock.speed
+        speed, limits = self.context.clock.speed, self._limits
+        rests = self._heard_at - self._moved > limits["rest_time"] / speed
+        late = now - self._fell > limits["longest_descent"] / speed
         again = self._signals > (self.supervisor.fault is Fault.SIGNAL)
         return again or self._ticked < 0.0 or rests or late
 
@@ -178,13 +180,13 @@ class AgentProcess:
         if reading is not None and all(map(math.isfinite, reading.x)):
             self._reading, self._heard_at = reading, now
             speed = math.hypot(*(reading.x[k] for k in self.context.flight["velocity"]))
-            self._moved = now if speed > _REST else self._moved
+            self._moved = now if speed > self._limits["rest_speed"] else self._moved
             self._tick(reading)
         if self._ticked >= 0.0 and self._reading is not None:
             self.supervisor.look((now - self._reading.time) * self.context.clock.speed)
         if self.supervisor.fault is not Fault.NONE:
             self._descend()
-        if now > self._reported + _REPORTS:
+        if now > self._reported + self._limits["report_period"]:
             self.report(now)
 
     def _read(self) -> Reading | None:
@@ -212,6 +214,7 @@ class AgentProcess:
             supervisor.trip(Fault.END)
         self._ticked = t
         if supervisor.fault is not Fault.NONE:
+            self._log(t, reading)
             return
         # Of this thread alone: how long others on the machine took is seen in the states' ages.
         began, wall = time.thread_time(), time.perf_counter()
@@ -222,8 +225,29 @@ class AgentProcess:
         self._longest = max(self._longest, self._ticks[-1])
         supervisor.spend((time.thread_time() - began) * self.context.clock.speed / (1 + missed))
         supervisor.check(result.u, result.valid)
-        if supervisor.fault is Fault.NONE:
-            self._act(result.u, result.letter, t)
+        flies = supervisor.fault is Fault.NONE
+        said = flies and self._act(result.u, result.letter, t)
+        self._log(t, reading, tuple(result.u) if flies else (), missed, said)
+
+    def _log(
+        self,
+        t: float,
+        reading: Reading,
+        u: tuple[float, ...] = (),
+        missed: int = 0,
+        sent: bool = False,
+    ) -> None:
+        log, supervisor = self.context.log, self.supervisor
+        if log is None:
+            return
+        fault = 0 if supervisor.fault is Fault.NONE else list(Fault).index(supervisor.fault)
+        self._fault_logged = fault > 0
+        age = (time.monotonic() - reading.time) * self.context.clock.speed
+        battery = math.nan if reading.battery is None else reading.battery
+        state = missed, sent, 1 + (fault > 0), fault, supervisor.amount, self.pilot.leader, age
+        log.tick(Tick(t, tuple(reading.x), u, *state, self._ticks[-1] if u else 0.0, battery))
+        if log.problem:
+            self._say(log.problem, "log")
 
     def _missed(self, t: float) -> int:
         """Return how many ticks are made up for at a time (s): the law counts its time by them.
@@ -231,31 +255,42 @@ class AgentProcess:
         A state that is up to a period late misses none, and does not make the next one early.
         """
         missed = max(0, int((t - self._due) / self._dt))
-        if missed > _MADE_UP:
+        # After a longer gap the law goes on from where it was.
+        if missed > self._limits["made_up_ticks"]:
             self._due = t + self._dt
             return 0
         self._due += (1 + missed) * self._dt
         return missed
 
-    def _act(self, u: list[float], letter: Message | None, t: float) -> None:
+    def _act(self, u: list[float], letter: Message | None, t: float) -> bool:
+        """Send an input, and a letter where one is due; return whether one was."""
         try:
             self.context.link.send(u)
         except FlightError as error:
             self._fail(error)
+        if self.context.link.notice:
+            self._say(self.context.link.notice)
         # At the network's rate, whatever the ticks that were skipped.
         due = math.floor(t / self.context.facts["network"]["period"] + 1e-6)
-        if letter is not None and due > self._sent:
+        said = letter is not None and due > self._sent
+        if letter is not None and said:
             self._sent = due
             self.context.socket.send(self.context.wire.letter(letter))
         if abs(self.supervisor.step - self._dt) > 0.1 * self._dt:
             step = f"{self.supervisor.step:.3g} s, and the law's period is {self._dt:g} s"
             self._say(f"states arrive every {step}", "period")
+        return said
 
     def _descend(self) -> None:
+        if not self._fault_logged and self._reading is not None:
+            # No state may come any more.
+            self._log(self.context.clock.now or math.nan, self._reading)
         self._say(f"{self.supervisor.sentence}; the vehicle levels and descends", "fault")
         try:
             if self._ticked >= 0.0:
                 self.context.link.level_descend()
+            if self.context.link.notice:
+                self._say(self.context.link.notice)
         except FlightError as error:
             self._fail(error)
 
@@ -280,18 +315,26 @@ class AgentProcess:
         if opened.sender == self.context.wire.number:
             self._meet(opened)
         elif isinstance(opened.body, Message):
-            return self.pilot.box.receive(opened.body, self.context.clock.now or 0.0)
+            return self._receive(opened.body, self.context.clock.now or 0.0)
         elif opened.kind is DatagramKind.START and isinstance(opened.body, float):
             return self._take_start(opened.body, opened.flight, time.time() - opened.stamp)
         elif opened.kind is DatagramKind.STOP:
             self.supervisor.trip(Fault.STOP)
         return None
 
+    def _receive(self, letter: Message, now: float) -> Drop | None:
+        """Use a letter at a time of the plan (s), or return why it is not used."""
+        why = self.pilot.box.receive(letter, now)
+        if why is None and self.context.log is not None:
+            self.context.log.receive(letter.sender, now, letter.row)
+        return why
+
     def _take_start(self, at: float, flight: int, late: float) -> Drop | None:
         """Let the plan of a flight start at a time (s since 1970) of a clock beside this one."""
         clock, weather = self.context.clock, self.context.flight["weather"]
         if not clock.started:
-            if not -_CLOCK < late < _CLOCK + (weather["delay"] + weather["jitter"]) / clock.speed:
+            differ = self._limits["start_difference"]
+            if not -differ < late < differ + (weather["delay"] + weather["jitter"]) / clock.speed:
                 return Drop.START
             try:
                 self.context.wire.begin(flight)
@@ -299,7 +342,16 @@ class AgentProcess:
                 self._say(str(error).rstrip("."))
                 return None
             clock.start(at)
+            self._begin_log(at)
         return None
+
+    def _begin_log(self, at: float) -> None:
+        """Open the log, on the ground or after a restart; where that fails, say so once."""
+        log, wire = self.context.log, self.context.wire
+        if log is not None:
+            log.begin(wire.flight, wire.boot, {"start": at, "wall": time.time()})
+            if log.problem:
+                self._say(log.problem, "log")
 
     def _meet(self, opened: Opened) -> None:
         """Judge a datagram with the agent's own number."""
@@ -349,6 +401,8 @@ class AgentProcess:
             # At once, since several processes write to one terminal.
             sys.stderr.write(f"agent {self.context.wire.number}: {sentence}.\n")
             sys.stderr.flush()
+            if self.context.log is not None:
+                self.context.log.say(self.context.clock.now, sentence)
             if key != "fault":
                 self._notes.append(sentence)
 

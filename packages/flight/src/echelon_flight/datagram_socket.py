@@ -5,7 +5,7 @@ import errno
 import ipaddress
 import socket
 from collections.abc import Iterator, Sequence
-from typing import Final, TypeAlias, final
+from typing import Final, Protocol, TypeAlias, final
 
 from echelon_flight import FlightError
 
@@ -39,6 +39,23 @@ def read_address(text: str, option: str) -> Address:
 def ports_of(agents: int, base: int = PORT) -> list[Address]:
     """Return where processes on this machine listen: each agent, and the ground station."""
     return [(LOOPBACK, base + k) for k in range(agents + 1)]
+
+
+class Datagrams(Protocol):
+    """What an agent sends datagrams to others with."""
+
+    def send(self, datagram: bytes) -> None:
+        """Send a datagram to all."""
+
+    def receive(self) -> Iterator[bytes]:
+        """Yield the datagrams that have arrived."""
+        ...
+
+    def skip(self) -> None:
+        """Skip what arrived while nobody listened."""
+
+    def close(self) -> None:
+        """Close the socket."""
 
 
 @final

@@ -5,21 +5,18 @@ import json
 import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final, final
 
 from echelon_flight import FlightError
 from echelon_flight.datagram_socket import DatagramSocket
 from echelon_flight.page_server import Handler
+from echelon_flight.parameters import DEFAULTS
 from echelon_flight.pilot import NOBODY
 from echelon_flight.supervisor import Fault
 from echelon_flight.wire import ALL, GROUND, Drop, Opened, Report, Wire, is_letter, name_of
 
-_AGAIN: Final = 0.2
-"""s between two commands that repeat: who restarts, or missed one, gets the next."""
-_SILENT: Final = 1.0
-"""s without a report, after which an agent counts as lost."""
 _NOTES: Final = 5
 """Of an agent that are shown at most: the last ones."""
 _MODES: Final = ("ready", "flies", "descends")
@@ -34,6 +31,7 @@ class Ground:
         wire: that signs for the ground.
         agents: how many there are.
         watch: called with the number of an agent and each of its reports.
+        parameters: the value of each, by name.
 
     Attributes:
         wire: likewise.
@@ -46,9 +44,12 @@ class Ground:
         wire: Wire,
         agents: int,
         watch: Callable[[int, Report], None] = lambda number, report: None,
+        parameters: Mapping[str, float] = DEFAULTS,
     ) -> None:
         """Hear nothing yet."""
         self._socket, self.wire, self._agents, self._watch = socket, wire, agents, watch
+        self._again, self._silence = parameters["command_period"], parameters["silent_agent"]
+        self._delay = parameters["start_delay"]
         self._reports, self._boots = dict[int, tuple[float, Report]](), dict[int, int]()
         self._notes: dict[int, dict[str, int]] = {k: {} for k in range(agents)}
         self._start: float | None = None
@@ -72,6 +73,14 @@ class Ground:
                 self.wire.begin(self.wire.next_flight(time.time()))
                 self._start = at
 
+    def start_soon(self) -> None:
+        """Let the plan start after the parameter `start_delay`, once.
+
+        Raises:
+            FlightError: the number of the flight cannot be stored.
+        """
+        self.start(time.time() + self._delay)
+
     def stop(self) -> None:
         """Let everybody level and descend, in whatever flight of which it knows."""
         # Above this flight and below the next one, in which the command no longer counts.
@@ -91,7 +100,7 @@ class Ground:
     def report(self, number: int) -> Report | None:
         """Return the last report of an agent that is alive; None of one that is silent."""
         heard, report = self._reports.get(number, (-math.inf, None))
-        return report if time.monotonic() - heard < _SILENT else None
+        return report if time.monotonic() - heard < self._silence else None
 
     @property
     def faults(self) -> dict[int, Fault]:
@@ -118,7 +127,7 @@ class Ground:
             opened = self.wire.open(datagram, None, time.time())
             if not isinstance(opened, Drop):
                 self._hear(opened)
-        if time.monotonic() > self._said + _AGAIN:
+        if time.monotonic() > self._said + self._again:
             self._said = time.monotonic()
             self._command(ALL)
 
@@ -174,7 +183,7 @@ class Ground:
         counts = zip(Drop, report.dropped, strict=True)
         return {
             "agent": number,
-            "mode": _MODES[min(report.mode, 2)] if silent < _SILENT else "silent",
+            "mode": _MODES[min(report.mode, 2)] if silent < self._silence else "silent",
             "why": "" if fault is Fault.NONE else fault.sentence(report.amount),
             "notes": self._noted(number),
             "silent": round(silent, 1),
@@ -214,7 +223,7 @@ def page_of(ground: Ground) -> type[Handler]:
             """Start the plan, or stop everybody."""
             if not self.allowed():
                 return
-            actions = {"/start": lambda: ground.start(time.time() + 2.0), "/stop": ground.stop}
+            actions = {"/start": ground.start_soon, "/stop": ground.stop}
             action = actions.get(self.path)
             if action is not None:
                 try:

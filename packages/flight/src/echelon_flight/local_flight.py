@@ -5,17 +5,15 @@ import math
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, Self, final
+from typing import Any, Self, final
 
 from echelon_flight import FlightError
 from echelon_flight.datagram_socket import LOOPBACK, DatagramSocket, ports_of
 from echelon_flight.ground import Ground
 from echelon_flight.mission import Mission, make_key
 from echelon_flight.wire import GROUND, Report
-
-_PATIENCE: Final = 20.0  # s until all agents are ready
 
 
 @final
@@ -29,6 +27,7 @@ class LocalFlight:
         port: of agent 0 on 127.0.0.1; the others have the next ones, then come the ground station,
             the bridge, and the vehicles.
         vehicles: the command of another simulation of the vehicles.
+        watch: called with the number of an agent and each of its reports.
 
     Attributes:
         ground: the ground station.
@@ -41,10 +40,11 @@ class LocalFlight:
         speed: float,
         port: int,
         vehicles: Sequence[str] = (),
+        watch: Callable[[int, Report], None] = lambda number, report: None,
     ) -> None:
         """Start the vehicles and the network."""
         self._mission, self._seconds, self._speed = mission, seconds, speed
-        self._key, self._others = mission.folder / "key", vehicles
+        self._key, self._others, self._watch = mission.folder / "key", vehicles, watch
         make_key(self._key)
         self._ports = ports_of(mission.agents, port)
         self._bridge, self._plant = (port + mission.agents + k for k in (1, 2))
@@ -53,7 +53,7 @@ class LocalFlight:
         self._begins = math.inf
         wire = mission.wire(GROUND, self._key)
         socket = DatagramSocket(self._ports[-1], self._ways(mission.agents))
-        self.ground = Ground(socket, wire, mission.agents, self._note)
+        self.ground = Ground(socket, wire, mission.agents, self._note, mission.parameters)
         self.ground.listen()
 
     def _ways(self, own: int) -> list[tuple[str, int]]:
@@ -63,6 +63,7 @@ class LocalFlight:
         return [address for k, address in enumerate(self._ports) if k != own]
 
     def _note(self, number: int, report: Report) -> None:
+        self._watch(number, report)
         if math.isfinite(report.x) and number in self._began:
             self.ready.setdefault(number, time.monotonic() - self._began[number])
 
@@ -78,7 +79,7 @@ class LocalFlight:
             self._begin("bridge", words)
 
     def _wait_until_ready(self) -> None:
-        deadline = time.monotonic() + _PATIENCE
+        deadline = time.monotonic() + (patience := self._mission.parameters["ready_patience"])
         while not (len(self.ready) == self._mission.agents and self.ground.ready):
             ended = [name for name, x in self._running.items() if x.poll() is not None]
             if ended:
@@ -86,7 +87,7 @@ class LocalFlight:
             if time.monotonic() > deadline:
                 missing = sorted({*range(self._mission.agents)} - {*self.ready})
                 raise FlightError(
-                    f"after {_PATIENCE:g} s agent {missing[0] if missing else 0} is not ready."
+                    f"after {patience:g} s agent {missing[0] if missing else 0} is not ready."
                 )
             time.sleep(0.02)
 

@@ -10,12 +10,15 @@ import os
 import secrets
 import stat
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Final, final
 
-from echelon_flight import FlightError
+from echelon_flight import FlightError, __version__
+from echelon_flight.flight_log import FOLDER, FlightLog
 from echelon_flight.links import check_scheme
+from echelon_flight.parameters import check_fence, values_of
 from echelon_flight.wire import GROUND, Wire
 
 _LARGEST_NUMBER: Final = 2**63
@@ -47,9 +50,10 @@ class Mission:
     Attributes:
         folder: likewise.
         facts: the content of flight.json.
+        parameters: the value of each, by name.
 
     Raises:
-        FlightError: it is no such folder, or of an earlier version.
+        FlightError: it is no such folder, of an earlier version, or has a number that is refused.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -60,6 +64,8 @@ class Mission:
                 f"`{folder}` was prepared by an earlier version; prepare it again with "
                 "`echelon fly`."
             )
+        self.parameters = values_of(self.facts)
+        check_fence(self.facts)
 
     @property
     def agents(self) -> int:
@@ -89,6 +95,20 @@ class Mission:
             )
         return load_module(file), facts
 
+    def log(self, law: Mapping[str, Any], vehicle: str) -> FlightLog:
+        """Return the log of an agent, in the folder `logs`.
+
+        Args:
+            law: the content of its law.json.
+            vehicle: as `--link` has it.
+        """
+        same = "agent", "formation", "dt", "states", "inputs", "message", "hears", "limits"
+        facts = {name: law.get(name) for name in same}
+        facts |= {"law": law["sha256"]["law.py"], "vehicle": vehicle, "by": __version__}
+        facts |= {"parameters": self.parameters, "network": law["network"]}
+        sizes = len(law["states"]), len(law["inputs"]), sum(law["message"].values())
+        return FlightLog(self.folder / FOLDER, facts, *sizes)
+
     def wire(self, number: int, key: Path | None) -> Wire:
         """Return what signs for an agent, or for the ground, by a key file.
 
@@ -99,7 +119,8 @@ class Mission:
         assert key is not None
         file = NumberFile(key, "ground" if number == GROUND else f"agent-{number}")
         common = secret, self.facts["formation"], number, self.agents, size
-        return Wire(*common, time.time_ns() // 1_000_000, file.read(), file.write)
+        boot, apart = time.time_ns() // 1_000_000, self.parameters["stamp_difference"]
+        return Wire(*common, boot, file.read(), file.write, apart)
 
 
 def load_module(file: Path) -> ModuleType:

@@ -9,12 +9,11 @@ from collections.abc import Collection, Mapping
 from types import ModuleType
 from typing import Any, Final, NamedTuple, final
 
+from echelon_flight.parameters import DEFAULTS
 from echelon_flight.wire import Drop, Message
 
 NOBODY: Final = 0xFFFF
 """The leader of an agent that knows none, as reports have it."""
-_AHEAD: Final = 0.05
-"""s; by so much a letter may be ahead of the receiver."""
 
 
 @final
@@ -24,13 +23,20 @@ class Letterbox:
     Args:
         facts: the content of law.json.
         backups: those that may take the lead, in a later term; any other leader has none.
+        ahead: s; by so much a letter may be ahead of the receiver.
 
     Attributes:
         letters: by sender; None before the first.
     """
 
-    def __init__(self, facts: Mapping[str, Any], backups: Collection[int] = ()) -> None:
+    def __init__(
+        self,
+        facts: Mapping[str, Any],
+        backups: Collection[int] = (),
+        ahead: float = DEFAULTS["letter_ahead"],
+    ) -> None:
         """Receive nothing yet."""
+        self._ahead = ahead
         self.letters = dict[int, Message | None].fromkeys(facts["hears"])
         sizes = facts["message"]
         places = dict(zip(sizes, itertools.accumulate(sizes.values(), initial=0), strict=False))
@@ -44,7 +50,7 @@ class Letterbox:
             return Drop.SENDER
         leader, said = self.leader_in(letter), letter.row[self._said]
         term = 0.0 if self._term is None else letter.row[self._term]
-        if max(letter.time, said) > clock + _AHEAD:
+        if max(letter.time, said) > clock + self._ahead:
             return Drop.AHEAD
         # A term that is no whole number would win over the next one.
         if term % 1.0 or term < 0.0 or leader not in (self._backups if term else self._leaders):
@@ -91,6 +97,7 @@ class Pilot:
         law: the module `law.py`.
         facts: the content of law.json.
         backups: those that may take the lead.
+        ahead: as `Letterbox` has it.
 
     Attributes:
         box: what it received.
@@ -98,11 +105,15 @@ class Pilot:
     """
 
     def __init__(
-        self, law: ModuleType, facts: Mapping[str, Any], backups: Collection[int] = ()
+        self,
+        law: ModuleType,
+        facts: Mapping[str, Any],
+        backups: Collection[int] = (),
+        ahead: float = DEFAULTS["letter_ahead"],
     ) -> None:
         """Begin without a memory."""
         self._law, self._number = law, facts["agent"]
-        self.box = Letterbox(facts, backups)
+        self.box = Letterbox(facts, backups, ahead)
         self.leader = self._number if facts["leads"] else NOBODY
         self._memory: list[float] | None = None
         self._last: TickResult | None = None

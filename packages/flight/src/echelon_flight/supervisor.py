@@ -11,12 +11,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple, final
 
 from echelon_flight.links import Reading
+from echelon_flight.parameters import values_of
 
-_STALE: Final = 0.1  # s
-_TILT: Final = 70.0  # degrees
-_BATTERY: Final = 0.15
-_OVERRUNS: Final = 10
-"""Ticks in a row, of which each takes longer than half a period: one may share the processor."""
 _STEPS: Final = 51
 """Between states, of which the median is compared with the law's period."""
 
@@ -25,16 +21,16 @@ class Fault(enum.Enum):
     """Why a vehicle descends, as a sentence with the number that says so."""
 
     NONE = "nothing is wrong"
-    STALE = "the newest state is {:.3g} s old, more than 0.1 s"
-    TILT = "the vehicle is tilted by {:.0f} degrees, more than 70"
+    STALE = "the newest state is {:.3g} s old, more than `stale_state` allows"
+    TILT = "the vehicle is tilted by {:.0f} degrees, more than `tilt` allows"
     FENCE = "the vehicle is {:.2f} m outside its fence"
     SPEED = "the vehicle moves at {:.2f} m/s, more than its fence allows"
     INPUT = "the law returned an input that is not finite"
-    OVERRUN = "a step of the law takes {:.0%} of its period, more than half"
-    PERIOD = "states arrive every {:.3g} s, at least twice the law's period"
+    OVERRUN = "a step of the law takes {:.0%} of its period, more than `overrun_share` allows"
+    PERIOD = "states arrive every {:.3g} s, too slowly for the law (`slow_states`)"
     STOP = "a signed stop command arrived"
     TWIN = "two agents have the number {:.0f}"
-    BATTERY = "{:.0%} of the battery is left, less than 15 %"
+    BATTERY = "{:.0%} of the battery is left, less than `low_battery` asks for"
     LINK = "the link to the vehicle failed"
     SIGNAL = "the process was asked to end"
     END = "the flight is over"
@@ -62,8 +58,8 @@ class Supervisor:
     """Watches one vehicle, and remembers its first fault.
 
     Args:
-        facts: the content of flight.json: `dt`, and the indices of `position`, `velocity` and
-            `tilt` (two angles) in the state.
+        facts: the content of flight.json: `dt`, `parameters`, and the indices of `position`,
+            `velocity` and `tilt` (two angles) in the state.
         fence: where the vehicle may be.
 
     Attributes:
@@ -73,7 +69,7 @@ class Supervisor:
 
     def __init__(self, facts: Mapping[str, Any], fence: Fence) -> None:
         """Begin without a fault."""
-        self._dt, self._fence = facts["dt"], fence
+        self._dt, self._fence, self._limits = facts["dt"], fence, values_of(facts)
         self._places = [facts[name] for name in ("position", "velocity", "tilt")]
         self.fault, self.amount = Fault.NONE, 0.0
         self._steps, self._before, self._slow = deque[float](maxlen=_STEPS), math.nan, 0
@@ -95,7 +91,7 @@ class Supervisor:
 
     def look(self, age: float) -> None:
         """Judge the age (s) of the newest state."""
-        if age > _STALE:
+        if age > self._limits["stale_state"]:
             self.trip(Fault.STALE, age)
 
     def judge(self, reading: Reading, time: float) -> None:
@@ -103,7 +99,7 @@ class Supervisor:
         position, velocity, angles = ([reading.x[k] for k in part] for part in self._places)
         if angles:
             tilt = math.degrees(math.acos(math.prod(map(math.cos, angles))))
-            if not tilt <= _TILT:
+            if not tilt <= self._limits["tilt"]:
                 self.trip(Fault.TILT, tilt)
         sides = zip(position, self._fence.low, self._fence.high, strict=True)
         outside = max((max(low - x, x - high) for x, low, high in sides), default=0.0)
@@ -112,7 +108,7 @@ class Supervisor:
         speed = math.hypot(*velocity)
         if not speed <= self._fence.speed:
             self.trip(Fault.SPEED, speed)
-        if reading.battery is not None and not reading.battery >= _BATTERY:
+        if reading.battery is not None and not reading.battery >= self._limits["low_battery"]:
             self.trip(Fault.BATTERY, reading.battery)
         self._pace(time)
 
@@ -121,13 +117,15 @@ class Supervisor:
         if time > self._before:
             self._steps.append(time - self._before)
         self._before = time
-        if self.step >= 2.0 * self._dt:
+        if self.step >= self._limits["slow_states"] * self._dt:
             self.trip(Fault.PERIOD, self.step)
 
     def spend(self, seconds: float) -> None:
         """Judge how long (s) the law took for a tick."""
-        self._slow = self._slow + 1 if seconds > 0.5 * self._dt else 0
-        if self._slow >= _OVERRUNS:
+        # Several in a row: one may share the processor.
+        slow = seconds > self._limits["overrun_share"] * self._dt
+        self._slow = self._slow + 1 if slow else 0
+        if self._slow >= self._limits["overrun_ticks"]:
             self.trip(Fault.OVERRUN, seconds / self._dt)
 
     def check(self, u: Sequence[float], valid: bool) -> None:

@@ -17,6 +17,7 @@ from collections.abc import Callable
 from typing import Final, NamedTuple, final
 
 from echelon_flight import FlightError
+from echelon_flight.parameters import DEFAULTS
 
 VERSION: Final = 3
 GROUND: Final = 0xFFFF
@@ -27,8 +28,6 @@ LONGEST: Final = 480
 """Bytes, which no network splits; 200 suffice for four outputs."""
 LARGEST: Final = 1e7
 """Of a number of a letter."""
-APART: Final = 1.0
-"""s; clocks that differ by more are wrong."""
 
 _HEAD: Final = struct.Struct("<BB8sHQQId")
 _SIGNATURE: Final = 16
@@ -53,13 +52,13 @@ class Drop(enum.Enum):
     SIGNATURE = "is signed with another key"
     NOT_FINITE = "has a number that is not finite"
     TOO_LARGE = "has a number larger than 1e7"
-    CLOCK = "has a time stamp that differs from this clock by more than 1 s"
+    CLOCK = "has a time stamp that is farther from this clock than `stamp_difference` allows"
     OLD = "is not newer than the last one from its sender"
     SENDER = "is from a sender that this process does not listen to"
     AHEAD = "has a time stamp ahead of this clock"
     PACKET = "has no packet of a leader"
     EARLY = "came before the start"
-    START = "gives the start by a clock that differs from this one by more than 0.1 s"
+    START = "gives the start by a clock farther from this one than `start_difference` allows"
     FLIGHT = "is of another flight"
     CHALLENGE = "answers an earlier process of this agent"
 
@@ -150,6 +149,7 @@ class Wire:
             process's.
         highest: flight number that a process of this number has used.
         store: keeps a flight number.
+        apart: s; clocks that differ by more are wrong.
 
     Attributes:
         flight: the number of the flight; 0 before it begins.
@@ -170,11 +170,13 @@ class Wire:
         boot: int,
         highest: int = 0,
         store: Callable[[int], object] = lambda number: None,
+        apart: float = DEFAULTS["stamp_difference"],
     ) -> None:
         """Begin to count."""
         self._key, self._formation = key, bytes.fromhex(formation)[:8]
         self.number, self.boot, self._agents, self._count = number, boot, agents, 0
         self._letter, self._store = struct.Struct(f"<{size - 1}d"), store
+        self._apart = apart
         self.flight, self.highest = 0, highest
         self.challenge, self.challenges = secrets.randbits(64), dict[int, int]()
         bodies = {
@@ -307,7 +309,8 @@ class Wire:
             return Drop.EARLY
         # A process whose clock was once far ahead would be believed for ever by its boot.
         # A stop is known to be new by its flight or challenge, and counts whatever the clocks say.
-        wrong = abs(stamp - clock) > APART or boot > 1e3 * (wall + APART)
+        apart = self._apart
+        wrong = abs(stamp - clock) > apart or boot > 1e3 * (wall + apart)
         if wrong and kind is not DatagramKind.STOP:
             return Drop.CLOCK
         opened = Opened(kind, sender, boot, flight, stamp, body)

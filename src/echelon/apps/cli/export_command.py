@@ -16,21 +16,23 @@ from echelon.output.archive.folder import check_empty, check_exists, claim_file,
 
 if TYPE_CHECKING:
     from echelon.agents.references.polynomials import Polynomials
+    from echelon.experiments.results.recording import Recording
     from echelon.simulation.engine.parts import Parts
 
-_LAW = "law"
+_LAW, _BAG = "law", "rosbag2"
 _MEMORY = 31
 """Pieces of 132 bytes that fit into the 4 kB which a Crazyflie has for trajectories."""
 
 
 def report(
     run: options.RunArgument,
+    beside: options.BesideOption = None,
     out: Annotated[
         Path | None, typer.Option(metavar="FILE.txt", help="Write it to this file instead.")
     ] = None,
     force: options.OverwriteOption = False,
 ) -> None:
-    """Print a run's numbers, the conditions of its guarantee, versions, and how to cite."""
+    """Print the numbers of a run or flight, the conditions of its guarantee, and its versions."""
     if out is not None:
         if ended := gone(VALUES, f"report --out {out.suffix.lower()}"):
             raise OutputError(f"a report as `{out.suffix}`{ended}")
@@ -40,11 +42,25 @@ def report(
     from echelon.output.archive.run_folder import load, report_beside
     from echelon.output.reports.run_report import whole_report
 
-    text = whole_report(recording_of(load(run)), report_beside(run))
+    recording = recording_of(load(run))
+    text = _beside(recording, beside) + whole_report(recording, report_beside(run))
     if out is None:
         print(text)
     else:
         write_file(out, text + "\n")
+
+
+def _beside(flown: "Recording", run: Path | None) -> str:
+    """Return where a flight and a run differ, as the first section of a report."""
+    if run is None:
+        return ""
+    from echelon.experiments.results.beside import beside
+    from echelon.experiments.results.recording import recording_of
+    from echelon.output.archive.run_folder import load
+
+    title = f"Beside {run}"
+    lines = beside(flown, recording_of(load(run))).lines()
+    return "\n".join([title, "-" * len(title), *lines, "", ""])
 
 
 def export(
@@ -58,7 +74,8 @@ def export(
         str | None,
         typer.Option(
             "--to",
-            help="csv, parquet, npz, mat, nc, html (default: the ending of --out, else csv); law.",
+            help="csv, parquet, npz, mat, nc, html, mcap (default: the ending of --out, else csv); "
+            "rosbag2, a folder; law.",
         ),
     ] = None,
     agent: Annotated[
@@ -71,7 +88,7 @@ def export(
     ] = None,
     force: options.OverwriteOption = False,
 ) -> None:
-    """Write a run for pandas, NumPy, MATLAB or a spreadsheet, or an agent's law as source code.
+    """Write a run for pandas, NumPy, MATLAB, a spreadsheet or ROS 2, or an agent's law as source.
 
     The law runs without echelon, on the agent's own computer: as Python, and as C.
     """
@@ -86,7 +103,10 @@ def export(
         return
     if set_:
         raise OutputError("`--set` is of a scenario, and a run is written as it is; leave it out.")
-    _write_run(Path(source), to, out, force)
+    if to == _BAG:
+        _write_bag(Path(source), Path("bag") if out is None else out)
+    else:
+        _write_run(Path(source), to, out, force)
 
 
 def _write_run(run: Path, to: str | None, out: Path | None, force: bool) -> None:
@@ -103,6 +123,20 @@ def _write_run(run: Path, to: str | None, out: Path | None, force: bool) -> None
     from echelon.output.archive.run_folder import load, report_beside
 
     write_file(file, content(load(run), report_beside(run)))
+
+
+def _write_bag(run: Path, folder: Path) -> None:
+    from echelon.output.archive.bags import save_bag
+
+    check_exists(run)
+    if folder.exists():
+        raise OutputError(f"`{folder}` exists; choose another name for the folder of the bag.")
+    STATUS.begin(f"reading {run}")
+    from echelon.output.archive.run_folder import load
+
+    with write_errors(folder):
+        save_bag(load(run), folder)
+    print(f"- Written to {folder}.")
 
 
 def _write_law(scenario: str, agent: int, changes: list[str], folder: Path) -> None:

@@ -19,12 +19,23 @@ CONTAINED = "0.1.0"
 """The version of the package `echelon_flight` that is installed with echelon."""
 _SCENARIO = "The name of a bundled scenario, a YAML file, or a folder that `--out` wrote."
 _Number = Annotated[int | None, typer.Option(help="Fly this agent.")]
+_Numbers = Annotated[
+    str | None, typer.Option(help="Fly these agents, such as 0,1,2, by one process and dongle.")
+]
 _All = Annotated[bool, typer.Option("--all", help="Fly all agents, with simulated vehicles.")]
 _Ground = Annotated[bool, typer.Option("--ground", help="Serve the ground station's page.")]
+_Ros = Annotated[
+    bool, typer.Option("--ros2", help="Publish poses, goals and markers to ROS 2, from the ground.")
+]
 _Dry = Annotated[
     bool, typer.Option("--dry-run", help="Check everything, and send nothing to others.")
 ]
-_Link = Annotated[str, typer.Option(help="Link to the vehicle: udp, cflib://... or px4://...")]
+_Link = Annotated[
+    str, typer.Option(help="Link to the vehicle: udp, cflib://..., px4://... or ros2://...")
+]
+_Positions = Annotated[
+    Path | None, typer.Option(help="A Python file whose class `Positions` yields positions.")
+]
 _Key = Annotated[Path | None, typer.Option(help="Key file that all agents and the ground share.")]
 _Listen = Annotated[
     str | None, typer.Option(help="Receive from others at ADDRESS:PORT, as of a multicast group.")
@@ -46,11 +57,14 @@ _Out = Annotated[
 def fly(
     scenario: Annotated[str, typer.Argument(help=_SCENARIO)],
     agent: _Number = None,
+    agents: _Numbers = None,
     every: _All = False,
     ground: _Ground = False,
     dry_run: _Dry = False,
+    ros2: _Ros = False,
     link: _Link = "udp",
     key: _Key = None,
+    positions: _Positions = None,
     listen: _Listen = None,
     interface: _Interface = None,
     seconds: _Seconds = None,
@@ -60,7 +74,7 @@ def fly(
 ) -> None:
     """Fly a scenario: a process for each agent, which needs neither JAX nor NumPy."""
     _check_version()
-    _check(agent, every, ground, key, link, out)
+    _check(agent, agents, every, ground, key, link, out)
     folder = Path(scenario)
     if not (folder / "flight.json").is_file():
         folder = _prepare(scenario, set_ or [], out)
@@ -68,11 +82,17 @@ def fly(
         print(f"- Written to {folder}; `echelon fly {folder} --all` flies it.")
         return
     given = {
-        **{"--agent": agent, "--link": link, "--key": key, "--listen": listen},
-        **{"--interface": interface, "--seconds": seconds, "--speed": speed},
+        **{"--agent": agent, "--agents": agents, "--link": link, "--key": key},
+        **{
+            "--positions": positions,
+            "--listen": listen,
+            "--interface": interface,
+            "--seconds": seconds,
+            "--speed": speed,
+        },
     }
     words = [str(word) for pair in given.items() if pair[1] is not None for word in pair]
-    flags = {"--all": every, "--ground": ground, "--dry-run": dry_run}
+    flags = {"--all": every, "--ground": ground, "--dry-run": dry_run, "--ros2": ros2}
     words += [flag for flag, is_set in flags.items() if is_set]
     STATUS.pause()
     sys.stdout.flush()
@@ -96,29 +116,41 @@ def _check_version() -> None:
 
 
 def _check(
-    agent: int | None, every: bool, ground: bool, key: Path | None, link: str, out: Path | None
+    agent: int | None,
+    agents: str | None,
+    every: bool,
+    ground: bool,
+    key: Path | None,
+    link: str,
+    out: Path | None,
 ) -> None:
     """Check what can be, before the laws are written, which takes long."""
     from echelon_flight.mission import check_options
 
-    tasks = [agent is not None, every, ground, out is not None]
-    if sum(tasks) != 1:
-        raise FlightError("give one of `--agent` with a number, `--all`, `--ground` and `--out`.")
-    check_options(link, key, signs=agent is not None or ground)
+    flies = agent is not None or agents is not None
+    if sum((agent is not None, agents is not None, every, ground, out is not None)) != 1:
+        raise FlightError(
+            "give one of `--agent` with a number, `--agents`, `--all`, `--ground` and `--out`."
+        )
+    check_options(link, key, signs=flies or ground)
 
 
 def _prepare(scenario: str, changes: list[str], out: Path | None) -> Path:
-    from echelon.experiments.scenario.scenario import load_scenario
+    from echelon.experiments.scenario.scenario import SCENARIO_FILE, load_scenario
 
     loaded = load_scenario(scenario, changes)
     if out is not None:
         check_empty(out)
     STATUS.begin(f"writing the laws of {loaded.name}")
-    from echelon.experiments.scenario.build import build
+    from echelon.experiments.scenario.build import build, origin_of
     from echelon.experiments.scenario.self_contained import content_of_files
     from echelon.output.archive.flight_folder import flight_files, save_flight
+    from echelon.output.archive.flown import PLAN, plan_file
 
-    files = flight_files(*build(loaded), content_of_files(loaded))
+    built, origin = build(loaded), origin_of(loaded)
+    files: dict[str, str | bytes] = dict(flight_files(*built, content_of_files(loaded)))
+    files |= {PLAN: plan_file(*built, origin), **origin["files"]}
+    files[SCENARIO_FILE] = origin["provenance"]["scenario_text"]
     folder = Path(tempfile.mkdtemp(prefix="echelon-fly-")) if out is None else out
     save_flight(files, folder)
     return folder

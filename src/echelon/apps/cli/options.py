@@ -17,6 +17,10 @@ def _check_port(port: int | None) -> int | None:
     return port
 
 
+def _check_run(run: Path | None) -> Path | None:
+    return None if run is None else check_exists(run)
+
+
 BrowserOption = Annotated[bool, typer.Option("--browser/--no-browser", help="Open a browser.")]
 FiguresOption = Annotated[bool, typer.Option("--figures/--no-figures", help="Draw the figures.")]
 ResumedFiguresOption = Annotated[
@@ -47,7 +51,15 @@ ResumeOption = Annotated[
 RunArgument = Annotated[
     Path,
     typer.Argument(
-        metavar="RUN", help="The folder of a run, or its `run.nc`.", callback=check_exists
+        metavar="RUN",
+        help="The folder of a run or a flight, or its `run.nc`.",
+        callback=check_exists,
+    ),
+]
+BesideOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--beside", metavar="RUN", help="Compare a flight with this run.", callback=_check_run
     ),
 ]
 ScenarioArgument = Annotated[

@@ -12,6 +12,7 @@ import typer
 
 from echelon.apps.cli import tables
 from echelon.apps.cli.options import (
+    BesideOption,
     BrowserOption,
     OverwriteOption,
     PortOption,
@@ -172,6 +173,7 @@ def live(
 
 def plot(
     run: RunArgument,
+    beside: BesideOption = None,
     what: Annotated[
         str | None, typer.Option(metavar="NAME,...", help=f"Only these: {', '.join(NAMES)}.")
     ] = None,
@@ -186,14 +188,14 @@ def plot(
     ] = None,
     force: OverwriteOption = False,
 ) -> None:
-    """Draw a run's figures again, as PNG, PDF and SVG."""
+    """Draw the figures of a run or a flight again, as PNG, PDF and SVG."""
     if dpi is not None and not _DPI[0] <= dpi <= _DPI[1]:
         raise OutputError(f"`--dpi` is {dpi}, and must be from {_DPI[0]} to {_DPI[1]}.")
     names = NAMES if what is None else tuple(filter(None, map(str.strip, what.split(","))))
     check_names(names)
     STATUS.begin(f"reading {run}")
     folder = (run if run.is_dir() else run.parent) / "figures" if out is None else out
-    drawings = _drawings(run, names, paper)
+    drawings = _drawings(run, names, paper, beside)
     if not drawings:
         raise OutputError("the run has no data for these figures.")
     # Figures in a run's own folder are replaced without a question.
@@ -209,18 +211,28 @@ def plot(
         print(f"- The run has no data for {listing(absent)}.")
 
 
-def _drawings(run: Path, names: Sequence[str], paper: bool) -> "dict[str, Figure]":
+def _drawings(
+    run: Path, names: Sequence[str], paper: bool, beside: Path | None
+) -> "dict[str, Figure]":
     from echelon.output.archive.run_folder import load
     from echelon.output.plots.run_figures import figures
     from echelon.output.plots.style import ONE_COLUMN, SCREEN, TWO_COLUMNS
 
     result = load(run)
     pages = {"_one_column": ONE_COLUMN, "_two_columns": TWO_COLUMNS} if paper else {"": SCREEN}
-    return {
+    drawings = {
         f"{name}{suffix}": figure
         for suffix, page in pages.items()
         for name, figure in figures(result, names, page).items()
     }
+    if beside is not None:
+        from echelon.experiments.results.beside import beside as compared
+        from echelon.experiments.results.recording import recording_of
+        from echelon.output.plots.beside_run import beside_figure
+
+        both = compared(recording_of(result), recording_of(load(beside)))
+        drawings |= {f"beside{x}": beside_figure(both, page) for x, page in pages.items()}
+    return drawings
 
 
 def video(

@@ -90,11 +90,12 @@ def save_dataset(run: "Result | xr.Dataset", path: PathLike) -> None:
 
 
 def run_file(result: Result, data: Labelled | None = None) -> bytes:
-    """Return `run.nc`: the dataset in groups, and the sums over all steps."""
-    return with_sums(result, data).netcdf(_group_of)
+    """Return `run.nc`: the dataset in groups, and the sums over all steps; a flight has none."""
+    data = labelled(result) if data is None else data
+    return (data if "flight" in data.attributes else with_sums(result, data)).netcdf(group_of)
 
 
-def _group_of(name: str, dimensions: tuple[str, ...]) -> str:
+def group_of(name: str, dimensions: tuple[str, ...]) -> str:
     """Return the group of a variable: the first that has its dimensions, else one of its own."""
     if name.startswith(SUM):
         return f"sums/{name.removeprefix(SUM)}"

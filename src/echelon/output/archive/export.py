@@ -76,8 +76,8 @@ def export(run: "Result", path: "PathLike", force: bool = False) -> Path:
     """Write a run as a file for other programs, and return its path.
 
     The ending chooses the format: `.csv` and `.parquet` have the columns of `table`, `.npz` and
-    `.mat` (MATLAB) arrays (times, agents, states), `.nc` is the `run.nc` of a folder, and `.html`
-    the page that `echelon view` shows. Videos are written by `save_video`.
+    `.mat` (MATLAB) arrays (times, agents, states), `.nc` is the `run.nc` of a folder, `.html` the
+    page that `echelon view` shows, and `.mcap` a bag of ROS 2. Videos are written by `save_video`.
 
     Args:
         run: a result.
@@ -87,7 +87,7 @@ def export(run: "Result", path: "PathLike", force: bool = False) -> Path:
     Raises:
         OutputError: there is no such format, the run has no stored frame, the file exists, or it
             cannot be written.
-        MissingExtraError: pyarrow, of Parquet, or the page's three.js is not installed.
+        MissingExtraError: pyarrow, of Parquet, rosbags, or the page's three.js is not installed.
     """
     from echelon.output.archive.folder import IN_PYTHON, claim_file, write_errors
 
@@ -195,6 +195,12 @@ def _page(run: "Result", numbers: str = "") -> bytes:
     return replay_page(data, reports=[text]).encode()
 
 
+def _mcap(run: "Result") -> bytes:
+    from echelon.output.archive.bags import mcap_content
+
+    return mcap_content(run)
+
+
 _WRITERS: "dict[str, Callable[[Result], bytes]]" = {
     "csv": lambda run: table(run).to_csv(index=False).encode(),
     "parquet": _parquet,
@@ -202,6 +208,7 @@ _WRITERS: "dict[str, Callable[[Result], bytes]]" = {
     "mat": _mat,
     "nc": _netcdf,
     "html": _page,
+    "mcap": _mcap,
 }
 
 _HEAD = """# For Crazyswarm2, by echelon. Edit the addresses. Before the start each vehicle

@@ -44,6 +44,7 @@ from echelon.simulation.onboard.source_code import LawFunction, c_text, header_t
 from echelon.simulation.scalars import Unsupported
 from echelon.simulation.step.networks import LateNetwork
 from echelon.simulation.step.settings import Settings
+from echelon_flight.parameters import DEFAULTS
 
 _EXCLUDES = (
     "state estimation, message formats and time-outs, the vehicle's own control loops, and a "
@@ -219,6 +220,8 @@ def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, 
         "weather": {"delay": network.delay, "jitter": network.jitter, "loss": network.loss},
         **_places(parts.model),
         "fence": _fence(parts, settings),
+        "parameters": dict(DEFAULTS),
+        "plan": _plan(parts, settings),
         "offsets": _offsets(parts, settings),
         "vehicles": vehicles[0],
     }
@@ -268,6 +271,20 @@ def _offsets(parts: Parts, settings: Settings) -> JsonObject:
     places = parts.formation.offsets_at(_EVERY * np.arange(count))
     rows = places[:, :, list(parts.model.position_indices())]
     return {"every": _EVERY, "rows": np.round(rows, 7).tolist()}
+
+
+def _plan(parts: Parts, settings: Settings) -> JsonObject | None:
+    """Return where the plan has each agent, m, every so often (s); None without a path."""
+    model, drive = parts.model, prepare(parts, settings).parts.drive
+    assert isinstance(drive, Laws)
+    times = _EVERY * np.arange(1 + math.ceil(settings.horizon / _EVERY))
+    with precision("float64"):
+        plan = Travels.of(drive.leader).reference_states(model, jnp.asarray(times))
+    if plan is None:
+        return None
+    places = list(model.position_indices())
+    goals = np.asarray(plan)[:, None, places] + parts.formation.offsets_at(times)[:, :, places]
+    return {"every": _EVERY, "rows": np.round(goals, 4).tolist()}
 
 
 def _fence(parts: Parts, settings: Settings) -> JsonObject:
@@ -358,7 +375,7 @@ def _autopilot(model: ControlAffine, rest: list[float]) -> JsonObject:
     }
 
 
-def save_flight(files: dict[str, str], folder: Path) -> None:
+def save_flight(files: Mapping[str, str | bytes], folder: Path) -> None:
     """Write the files into a folder that is new or empty.
 
     Raises:

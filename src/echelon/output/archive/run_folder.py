@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
+from typing import overload
 
 from echelon.core.errors import Outcome, OutputError
 from echelon.core.files import INPUTS, write_atomic
@@ -23,6 +24,7 @@ from echelon.experiments.scenario.scenario import (
 )
 from echelon.experiments.scenario.self_contained import names_files
 from echelon.output.archive.chunks import Chunks
+from echelon.output.archive.flown import PLAN, flight_data, root_of
 from echelon.output.archive.folder import (
     DATA,
     GAIN,
@@ -33,6 +35,7 @@ from echelon.output.archive.folder import (
     claim_folder,
     write_errors,
 )
+from echelon.output.archive.recorded import Recorded, recorded
 from echelon.output.reports.run_report import report
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
@@ -103,8 +106,16 @@ def write_findings(result: Result, folder: Path, figures: bool = True) -> None:
             save_figures(recording(data.arrays(), data.attributes), folder)
 
 
-def load(place: PathLike, parts: Parts | None = None) -> Result:
-    """Return the run in a folder, or in its `run.nc`, whatever its state.
+@overload
+def load(place: PathLike, parts: Parts | None = None, agents: None = None) -> Result: ...
+@overload
+def load(place: PathLike, parts: None = None, *, agents: Mapping[int, str]) -> Recorded: ...
+
+
+def load(
+    place: PathLike, parts: Parts | None = None, agents: Mapping[int, str] | None = None
+) -> Result | Recorded:
+    """Return a run, whatever its state; or a flight, or what others recorded.
 
     Of a run that was stopped or killed, or is still computed, it is what is stored. States and all
     else in `run.nc` are read without executing code; `parts` and what needs them (such as `report`,
@@ -112,12 +123,19 @@ def load(place: PathLike, parts: Parts | None = None) -> Result:
     names, as does a run that was killed before its `run.nc` was written.
 
     Args:
-        place: the folder of a run, or a netCDF file such as its `run.nc`.
+        place: the folder of a run, or a netCDF file such as its `run.nc`; the folder of a flight,
+            or that of one of its flights in `logs`, whose agents' logs are joined; with `agents` a
+            bag of ROS 2 (folder, `.mcap`, `.db3`), a ULog (`.ulg`) or a Crazyflie's log (`.csv`).
         parts: those of a run that was made in Python, which no file contains.
+        agents: the topic of each agent in a recording of others: PoseStamped or Odometry in a bag,
+            `vehicle_odometry` or `vehicle_local_position` in a ULog, `stateEstimate` in a log. The
+            result then has `times` (T,), `states` (T, N, n), `state_names`, and `tracks`.
 
     Raises:
         OutputError: there is no run, it is damaged, or of a format that is not read. Also raised
             when `parts` are first read, if there is no scenario or it was changed since the run.
+            A recording lacks a topic.
+        MissingExtraError: a recording needs a library that is not installed.
         ScenarioError: the scenario of a killed run cannot be read.
     """
     if not isinstance(place, str | os.PathLike):
@@ -125,9 +143,14 @@ def load(place: PathLike, parts: Parts | None = None) -> Result:
             f"`place` is {place!r}, and must be the folder of a run, or its `{DATA}`."
         )
     path = check_exists(Path(place))
+    if agents is not None:
+        return recorded(path, agents)
     if path.is_file():
-        return _stored(path, parts)
-    stored = _stored(path / DATA, parts) if (path / DATA).is_file() else None
+        return _stored(path, read_recording(path)[1], parts)
+    if root_of(path) is not None:
+        return _stored(*flight_data(path), parts)
+    file = path / DATA
+    stored = _stored(file, read_recording(file)[1], parts) if file.is_file() else None
     chunks = Chunks(path)
     if chunks.exist:
         segments = chunks.read()
@@ -154,9 +177,8 @@ def _unfinished(folder: Path, segments: list[Segment]) -> Result:
     return dataclasses.replace(result, **origin_of(scenario))
 
 
-def _stored(file: Path, parts: Parts | None) -> Result:
-    _, data = read_recording(file)
-    within = file.name == DATA
+def _stored(file: Path, data: Labelled, parts: Parts | None) -> Result:
+    within = file.name in (DATA, PLAN)
     names = sorted((file.parent / INPUTS).rglob("*")) if within else []
     files = {x.relative_to(file.parent).as_posix(): x.read_bytes() for x in names if x.is_file()}
     seconds = _seconds(file.with_name(SUMMARY)) if within else float("nan")
@@ -194,7 +216,7 @@ def _result(
         warnings=tuple(attributes["warnings"].splitlines()),
         settings=settings,
         wall_time=seconds,
-        sums=Later(partial(_sums, file, arrays)),
+        sums=Later(partial(_sums, file, arrays, "flight" in attributes)),
         parts=Later(built),
         work=None if solver is None else SolverStats(**json.loads(solver)),
         engine=attributes["computed_by"],
@@ -203,7 +225,12 @@ def _result(
     )
 
 
-def _sums(file: Path, arrays: Mapping[str, Array]) -> Sums:
+def _sums(file: Path, arrays: Mapping[str, Array], flown: bool) -> Sums:
+    if flown:
+        raise OutputError(
+            "a flight has no sums over steps, which metrics are computed from; `echelon report "
+            "FLIGHT` prints its numbers."
+        )
     if any(SUM + name not in arrays for name in Sums._fields):
         raise OutputError(
             f"`{file}` has no sums over all steps, which metrics and the report are computed from; "

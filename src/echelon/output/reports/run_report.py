@@ -87,10 +87,11 @@ def report(result: Result) -> str:
 def whole_report(run: Recording, numbers: str) -> str:
     """Return the numbers of a run, its guarantee with all conditions, and where it is from."""
     message, stated = str(run.attributes["message"]), run.guarantee
+    flown = str(run.attributes.get("flight_report", ""))
     facts = f"{run.agents} agents, {run.model}; {run.horizon:g} s in steps of {run.dt:g} s"
     versions = {k[8:]: v for k, v in run.attributes.items() if k.startswith("version_")}
     sections = {
-        f"{run.name}: {facts}": numbers.rstrip() or _known(message, stated),
+        f"{run.name}: {facts}": numbers.rstrip() or flown or _known(message, stated),
         "Conditions of the guarantee": _wrapped(*map(_condition, stated.get("conditions", ()))),
         "Scenario": str(run.attributes.get("scenario_text", "")).rstrip(),
         "Versions": "\n".join(f"{name} {version}" for name, version in versions.items()),

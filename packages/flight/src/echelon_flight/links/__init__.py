@@ -15,6 +15,7 @@ LINKS: Final = {
     "udp": "echelon_flight.links.udp:UdpLink",
     "cflib": "echelon_flight.links.crazyflie:CflibLink",
     "px4": "echelon_flight.links.px4:Px4Link",
+    "ros2": "echelon_flight.links.ros2:Ros2Link",
 }
 """Scheme of an address -> `module:class`."""
 
@@ -39,16 +40,19 @@ class Link(abc.ABC):
 
     Args:
         address: the text after `scheme://`; "" if there is none.
-        facts: the content of law.json: `agent`, `dt`, `states` and `inputs` with their units.
+        facts: the content of law.json: `agent`, `dt`, `states` and `inputs` with their units; and
+            `parameters` of the flight.
 
     Attributes:
         inputs: the names of the law's inputs that it can send, in order, such as
             `("roll", "pitch", "yaw_rate", "thrust")`; None for any.
         watchdog: whether the vehicle levels by itself when inputs no longer arrive.
+        notice: what the ground should know of the link, a sentence without its full stop; or "".
     """
 
     inputs: ClassVar[tuple[str, ...] | None] = None
     watchdog: ClassVar[bool] = False
+    notice: str = ""
 
     @abc.abstractmethod
     def __init__(self, address: str, facts: Mapping[str, Any]) -> None:

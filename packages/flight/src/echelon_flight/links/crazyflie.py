@@ -23,15 +23,12 @@ from typing import Any, ClassVar, Final, NamedTuple, final
 from echelon_flight import FlightError, MissingLibraryError
 from echelon_flight.links import Link, Reading, listing
 from echelon_flight.links.attitude import Numbers, check_states, named_state, quaternion_of
+from echelon_flight.parameters import DEFAULTS
 
 _FULL_THRUST: Final = 0.48
 """Of four motors of a Crazyflie 2.1+ with the firmware's compensation of its battery, N."""
-_PATIENCE: Final = 20.0
-"""s until a Crazyflie has told its variables and parameters."""
-_VOLTS: Final = (3.0, 4.1)
-"""Of an empty and of a full battery, in flight."""
-_SINKING, _GROUND, _LONGEST = 0.93, 0.05, 5.0
-"""A descent: the share of the weight (0.7 m/s^2), its end above z = 0 (m), or at the latest (s)."""
+_KALMAN: Final = 2
+"""The firmware's estimator that takes positions."""
 
 
 class _Route(NamedTuple):
@@ -77,6 +74,7 @@ class CflibLink(Link):
         """Connect, choose the controller, start the log."""
         self._route = _route_of(tuple(facts["inputs"]))
         self._states = check_states(facts["states"])
+        self._limits = limits = facts.get("parameters", DEFAULTS)
         uri, _, thrust = address.partition("#")
         self._full_thrust = _newtons(thrust) if thrust else _FULL_THRUST
         self._weight = facts["trim"].get("thrust", 0.5 * self._full_thrust)
@@ -84,19 +82,21 @@ class CflibLink(Link):
         self._arrival = threading.Condition()
         self._newest: Reading | None = None
         self._known: dict[str, float] = {}
-        self._failure = ""
+        self._failure, self._placed = "", math.inf
         self._owns = crazyflie is None
-        self._crazyflie = _connected(uri) if crazyflie is None else crazyflie
+        self._crazyflie = crazyflie or _connected(uri, limits["cflib_patience"])
         self._crazyflie.connection_lost.add_callback(lambda _, why: self._fail(why))
         self._prepare()
 
     def read(self, wait: float) -> Reading | None:
         """Return the newest state that was not yet returned."""
+        if time.monotonic() > self._placed + (age := self._limits["position_age"]):
+            self.lose(f"no position came from outside for {age:g} s")
         with self._arrival:
             if self._newest is None and wait > 0.0 and not self._failure:
                 self._arrival.wait(wait)
             reading, self._newest = self._newest, None
-        if reading is None and self._failure:
+        if (reading is None or self._placed < math.inf) and self._failure:
             raise FlightError(f"the link to the Crazyflie failed: {self._failure}.")
         return reading
 
@@ -111,15 +111,38 @@ class CflibLink(Link):
             setpoint = full_state_setpoint(self._known, u)
             self._crazyflie.commander.send_full_state_setpoint(*setpoint)
 
+    def hover(self, place: Sequence[float], yaw: float) -> None:
+        """Let the firmware hold a place (m) and a yaw (rad) by its own position controller."""
+        if self._locked:
+            self._unlock()
+        self._crazyflie.commander.send_position_setpoint(*place, math.degrees(yaw))
+
+    def expect_positions(self, within: float) -> None:
+        """Fail if no position came from outside within a time (s), and choose the estimator."""
+        self._crazyflie.param.set_value("stabilizer.estimator", _KALMAN)
+        self._placed = time.monotonic() + within - self._limits["position_age"]
+
+    def locate(self, pose: Sequence[float]) -> None:
+        """Send a place (m), with or without a quaternion (x, y, z, w), to the estimator."""
+        self._placed, sender = time.monotonic(), self._crazyflie.extpos
+        (sender.send_extpos if len(pose) == 3 else sender.send_extpose)(*pose)
+
+    def lose(self, why: str) -> None:
+        """Let the link fail, and so the vehicle descend; states no longer count."""
+        with self._arrival:
+            self._newest = None
+        self._fail(why)
+
     def level_descend(self) -> None:
         """Let the vehicle sink level, then switch its motors off."""
-        now, low = time.monotonic(), self._known.get("z", math.inf) < _GROUND
-        self._end = min(self._end, now + _LONGEST)
+        now, limits = time.monotonic(), self._limits
+        self._end = min(self._end, now + limits["sinking_time"])
+        low = self._known.get("z", math.inf) < limits["landed_height"]
         self._down |= low or now > self._end
         if self._down:
             self._crazyflie.commander.send_stop_setpoint()
         else:
-            self._manual((0.0, 0.0, 0.0, _SINKING * self._weight), rates=False)
+            self._manual((0.0, 0.0, 0.0, limits["sinking_thrust"] * self._weight), rates=False)
 
     def close(self) -> None:
         """Let go of the link."""
@@ -159,7 +182,7 @@ class CflibLink(Link):
 
         parameters.add_update_callback(group="stabilizer", name="controller", cb=confirm)
         parameters.set_value("stabilizer.controller", controller)
-        if not chosen.wait(_PATIENCE):
+        if not chosen.wait(self._limits["cflib_patience"]):
             raise FlightError(
                 "the Crazyflie does not confirm its parameter `stabilizer.controller`."
             )
@@ -171,7 +194,8 @@ class CflibLink(Link):
         self._crazyflie.commander.send_setpoint(0.0, 0.0, 0.0, 0)
 
     def _receive(self, _: int, values: Mapping[str, Any], __: object) -> None:
-        known, (empty, full) = state_of_log(values), _VOLTS
+        known = state_of_log(values)
+        empty, full = self._limits["empty_battery"], self._limits["full_battery"]
         battery = max(0.0, min(1.0, (values["pm.vbat"] - empty) / (full - empty)))
         reading = Reading(time.monotonic(), [known[name] for name in self._states], battery)
         with self._arrival:
@@ -206,7 +230,7 @@ def _newtons(text: str) -> float:
     return value
 
 
-def _connected(uri: str) -> Any:
+def _connected(uri: str, patience: float) -> Any:
     """Return the open Crazyflie at an address of cflib."""
     try:
         import cflib.crtp  # pyright: ignore[reportMissingImports]
@@ -221,8 +245,8 @@ def _connected(uri: str) -> Any:
     crazyflie.fully_connected.add_callback(lambda _: done.set())
     crazyflie.connection_failed.add_callback(lambda _, why: (failures.append(why), done.set()))
     crazyflie.open_link(uri)
-    if not done.wait(_PATIENCE) or failures:
-        why = failures[0].partition("\n")[0] if failures else f"no answer for {_PATIENCE:g} s"
+    if not done.wait(patience) or failures:
+        why = failures[0].partition("\n")[0] if failures else f"no answer for {patience:g} s"
         raise FlightError(f"there is no Crazyflie at `{uri}`: {why.rstrip('.')}.")
     return crazyflie
 

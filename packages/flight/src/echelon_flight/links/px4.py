@@ -23,11 +23,8 @@ from echelon_flight.links.attitude import (
     quaternion_of,
     rotate,
 )
+from echelon_flight.parameters import DEFAULTS
 
-_PATIENCE: Final = 10.0
-"""s for a first heartbeat, and for each answer."""
-_AHEAD: Final = 1.0
-"""s of setpoints before OFFBOARD is asked for: PX4 wants two a second before."""
 _OFFBOARD, _LAND = (6, 0), (4, 6)
 """PX4's main and sub modes."""
 _SET_INTERVAL, _SET_MODE, _ODOMETRY = 511, 176, 331
@@ -57,7 +54,10 @@ class Px4Link(Link):
     def __init__(self, address: str, facts: Mapping[str, Any]) -> None:
         """Connect, ask for the state every `dt`, read the thrust of hovering."""
         self._states, self._trim = check_states(facts["states"]), facts["trim"]["thrust"]
-        self._wire = _connected(address)
+        limits = facts.get("parameters", DEFAULTS)
+        # PX4 wants two setpoints a second before.
+        self._patience, self._lead = limits["mavlink_patience"], limits["offboard_lead"]
+        self._wire = _connected(address, self._patience)
         self._yaw = 0.0
         self._mode: tuple[int, int] | None = None
         self._first, self._beat = math.inf, -math.inf
@@ -80,7 +80,7 @@ class Px4Link(Link):
         attitude, rate, thrust = attitude_target(u, self._yaw, self._hover, self._trim)
         self._target(attitude, rate, thrust)
         self._first = min(self._first, now)
-        if now > self._first + _AHEAD:
+        if now > self._first + self._lead:
             self._enter(_OFFBOARD)
 
     def level_descend(self) -> None:
@@ -139,7 +139,7 @@ class Px4Link(Link):
 
     def _parameter(self, name: bytes) -> float:
         """Return the value of a parameter of PX4."""
-        wire, until = self._wire, time.monotonic() + _PATIENCE
+        wire, until = self._wire, time.monotonic() + self._patience
         while time.monotonic() < until:
             wire.mav.param_request_read_send(wire.target_system, wire.target_component, name, -1)
             value = self._next("PARAM_VALUE", 0.5)
@@ -148,7 +148,7 @@ class Px4Link(Link):
         raise FlightError(f"PX4 does not send its parameter `{name.decode()}`.")
 
 
-def _connected(address: str) -> Any:
+def _connected(address: str, patience: float) -> Any:
     """Return the open connection of pymavlink to a vehicle that sent a heartbeat."""
     # Otherwise pymavlink speaks version 1, which has no `ODOMETRY`.
     os.environ["MAVLINK20"] = "1"
@@ -163,9 +163,9 @@ def _connected(address: str) -> Any:
     # What is no address of a network is taken for a serial port, which needs pyserial.
     except (ImportError, OSError, ValueError) as error:
         raise FlightError(f"`px4://{address}` cannot be opened: {error}.") from None
-    if wire.wait_heartbeat(timeout=_PATIENCE) is None:
+    if wire.wait_heartbeat(timeout=patience) is None:
         wire.close()
-        raise FlightError(f"there is no PX4 at `{address}`: no heartbeat for {_PATIENCE:g} s.")
+        raise FlightError(f"there is no PX4 at `{address}`: no heartbeat for {patience:g} s.")
     return wire
 
 
