@@ -164,3 +164,29 @@ def test_what_has_no_slope_is_refused_in_words():
     ):
         with pytest.raises(ech.EchelonError, match=told):
             ech.gradient(given, settings, cost, (wrt,))
+
+
+def test_a_cost_over_a_late_network_has_the_slope_of_differences():
+    late = "network={rate: 50, delay: 0.05, loss: 0.2}"
+    changes = (late, "simulation.horizon=2", "report.steady_window=1", "simulation.engine=jax")
+    parts, settings = ech.build(ech.load_scenario("integrators", changes))
+    starts = np.asarray(ech.simulate(parts, settings).states[0])
+    parts = parts.replace(initial=starts, start_error={})
+    found = ech.gradient(parts, settings, lambda sums: sums.errors[0].sum(), ["initial"])
+
+    def cost(x):
+        return ech.simulate(parts.replace(initial=x), settings).sums.errors[0].sum()
+
+    for way in np.random.default_rng(0).normal(size=(3, *starts.shape)):
+        slope = (cost(starts + 1e-5 * way) - cost(starts - 1e-5 * way)) / 2e-5
+        assert (found.slopes["initial"] * way).sum() == pytest.approx(slope, rel=1e-6)
+
+
+@pytest.mark.slow
+def test_where_agents_keep_apart_a_sentence_names_what_has_no_derivative():
+    parts, settings = ech.build(ech.load_scenario("crossing"))
+    settings = settings._replace(horizon=0.1, steady_window=0.1)
+    with pytest.raises(
+        ech.errors.SimulationError, match="whose end depends on numbers, as `safety`"
+    ):
+        ech.gradient(parts, settings, lambda sums: sums.errors[0].sum(), ["initial"])

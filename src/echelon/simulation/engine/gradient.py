@@ -66,8 +66,8 @@ def gradient(parts: Parts, settings: Settings, cost: Cost, wrt: Sequence[str]) -
 
     Raises:
         EchelonError: a part is malformed or does not fit the others; the agents are not driven by
-            laws, or these have no gain; messages are late; a variable is unknown; the cost fails,
-            or is not one number.
+            laws, or these have no gain; the end of a loop depends on numbers, as in `safety`;
+            a variable is unknown; the cost fails, or is not one number.
     """
     if isinstance(wrt, str):
         raise SimulationError(f"`wrt` is the text {wrt!r}, and must be a list, such as [{wrt!r}].")
@@ -76,10 +76,6 @@ def gradient(parts: Parts, settings: Settings, cost: Cost, wrt: Sequence[str]) -
             "got a formation that changes, but derivatives are of constant ones; leave out "
             "`motion` here, and give it to the runs afterwards."
         )
-    if parts.world.network is not None:
-        raise SimulationError("got a network, but derivatives are of messages that are never late.")
-    if parts.drive.safety is not None:
-        raise SimulationError("got `safety`, but derivatives are of agents that do not keep apart.")
     with precision("float64"):
         # No frame is stored, and no cost depends on who is closest.
         prepared = prepare(parts, settings._replace(store_every=1))
@@ -88,9 +84,17 @@ def gradient(parts: Parts, settings: Settings, cost: Cost, wrt: Sequence[str]) -
         assert isinstance(drive, Laws)  # `_values_of` rejects all others
         loop = assemble(problem, drive.leader, drive.follower)
         reference = sample_reference(prepared, 0, settings.steps)
-        (value, sums), slopes = _differentiate(
-            loop, values, problem.states, reference, settings.steps, cost
-        )
+        try:
+            (value, sums), slopes = _differentiate(
+                loop, values, problem.states, reference, settings.steps, cost
+            )
+        except ValueError as error:
+            if "Reverse-mode" not in str(error):
+                raise
+            raise SimulationError(
+                "the steps have a loop whose end depends on numbers, as `safety` has and "
+                "`prediction: packet` of states, and JAX has no derivative of it."
+            ) from error
     by_variable = {name: np.asarray(slope) for name, slope in slopes.items()}
     for name in {"P", "R"} & by_variable.keys():
         by_variable[name] = 0.5 * (by_variable[name] + by_variable[name].T)
