@@ -167,11 +167,14 @@ def test_what_has_no_slope_is_refused_in_words():
 
 
 def test_a_cost_over_a_late_network_has_the_slope_of_differences():
-    late = "network={rate: 50, delay: 0.05, loss: 0.2}"
-    changes = (late, "simulation.horizon=2", "report.steady_window=1", "simulation.engine=jax")
-    parts, settings = ech.build(ech.load_scenario("integrators", changes))
-    starts = np.asarray(ech.simulate(parts, settings).states[0])
-    parts = parts.replace(initial=starts, start_error={})
+    model, path = ech.models.DoubleIntegrator(2), ech.Graph.path(3)
+    gain = ech.synthesize(model, path, ech.gains.Riccati())
+    leader = ech.laws.Tracking(ech.references.Circle(radius=1.0, rate=0.5), gain)
+    laws = ech.Laws(leader, ech.laws.Consensus(gain, feedforward="relay"))
+    late = ech.World(network=ech.Network(rate=50.0, delay=0.05, loss=0.2))
+    starts = np.random.default_rng(1).normal(size=(3, 4))
+    parts = ech.Parts(model, path, ech.Formation.line(model, path), laws, starts, world=late)
+    settings = ech.Settings(horizon=2.0, dt=0.02)
     found = ech.gradient(parts, settings, lambda sums: sums.errors[0].sum(), ["initial"])
 
     def cost(x):
