@@ -157,4 +157,7 @@ class PairWatch:
 
 def _squares(apart: Float[np.ndarray, "d ..."]) -> Array:
     """Return squared lengths, added up axis by axis in the same precision as in a kernel."""
-    return sum((axis * axis for axis in apart[1:]), apart[0] * apart[0])
+    total = apart[0] * apart[0]
+    for axis in apart[1:]:
+        total = total + axis * axis
+    return total
