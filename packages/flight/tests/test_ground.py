@@ -1,8 +1,10 @@
 """The ground station, beside agents that this test plays, under a clock that it moves."""
 
+import json
 import math
 import threading
 import time
+import urllib.error
 import urllib.request
 from pathlib import Path
 
@@ -69,6 +71,35 @@ def test_a_number_that_cannot_be_stored_is_shown_and_starts_nothing(station):
     # A stop needs no file.
     ground.stop()
     assert ground.state()["stopped"]
+
+
+def test_a_phone_sees_and_stops_and_starts_nothing(station):
+    ground = station.station()
+    with page_of(ground).serving_others() as address:
+        near = "http://127.0.0.1:" + address.rpartition(":")[2]
+        shown = json.loads(urllib.request.urlopen(f"{near}state").read())
+        assert shown["stops_only"] and len(shown["agents"]) == len(ground.state()["agents"])
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            urllib.request.urlopen(urllib.request.Request(f"{near}start", b""))
+        assert not ground.state()["started"] and not ground.state()["stopped"]
+        urllib.request.urlopen(urllib.request.Request(f"{near}stop", b""))
+        assert ground.state()["stopped"]
+
+
+def test_each_row_names_the_nearest_agent_by_the_last_reports(station):
+    ground, agents = station.ground, (wire(0), wire(1))
+    for number, place in ((0, (0.0, 0.0, 1.0)), (1, (3.0, 4.0, 1.0))):
+        x, y, z = place
+        station.say(agents[number].report, REPORT._replace(x=x, y=y, z=z, step=0.01))
+    first, second = ground.state()["agents"][:2]
+    assert (first["nearest"], second["nearest"]) == ((5.0, 1), (5.0, 0))
+    assert first["rate"] == 100.0
+    # A place that is not known is near to nobody; what moves in a plane has no z.
+    station.say(agents[1].report, REPORT._replace(x=math.nan, y=1.0, z=1.0))
+    assert ground.state()["agents"][0]["nearest"] is None
+    for number, x in ((0, 0.0), (1, 2.0)):
+        station.say(agents[number].report, REPORT._replace(x=x, y=0.0, z=math.nan))
+    assert ground.state()["agents"][0]["nearest"] == (2.0, 1)
 
 
 def test_the_station_keeps_the_number_of_a_flight_and_of_a_stop(tmp_path, station):

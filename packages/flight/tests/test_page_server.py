@@ -38,3 +38,16 @@ def test_only_pages_of_this_server_are_answered_and_a_port_in_use_is_left(monkey
         with pytest.raises(FlightError, match=r"^ports \d+ to \d+ are in use; give another"):
             with Page.serving(port):
                 pass
+
+
+def test_other_machines_need_the_word_in_the_address():
+    with Page.serving_others() as address:
+        port, word = address.rstrip("/").rpartition(":")[2].split("/")
+        near = f"http://127.0.0.1:{port}"
+        assert answer(f"{near}/{word}/") == (200, b"<html>")
+        assert answer(f"{near}/{word}/", Origin=near)[0] == 200
+        assert answer(f"{near}/{word}/", Origin="http://example.org")[0] == 403
+        for path in ("/", "/index.html", f"/{word}", f"/{word}x/", f"/{word[:-1]}/", "//"):
+            assert answer(near + path)[0] == 403
+    with Page.serving_others() as other:
+        assert word not in other and len(word) >= 12

@@ -48,6 +48,7 @@ def _options() -> argparse.Namespace:
     say("--agents", help="fly these agents, such as 0,1,2, by one process and one dongle")
     say("--all", action="store_true", help="fly all, with simulated vehicles")
     say("--ground", action="store_true", help="serve the page of the ground station")
+    say("--phone", action="store_true", help="let phones on the network see the page, and stop")
     say("--ros2", action="store_true", help="publish poses, goals and markers to ROS 2")
     say("--dry-run", action="store_true", help="check everything, and send nothing to others")
     say("--link", default="udp", help="to the vehicle: udp, cflib://.., px4://.. or ros2://..")
@@ -76,6 +77,8 @@ def _run(mission: Mission, options: argparse.Namespace) -> int:
     # Imported where they are used: an agent's process stays small.
     if options.ros2 and not (options.ground or options.all):
         raise FlightError("`--ros2` is for the ground station: give it with `--ground` or `--all`.")
+    if options.phone and not options.ground:
+        raise FlightError("`--phone` is for the ground station: give it with `--ground`.")
     if options.vehicles:
         from echelon_flight.simulated_vehicles import Vehicles, simulated
 
@@ -219,8 +222,12 @@ def _watch(mission: Mission, options: argparse.Namespace) -> int:
     view = _view(mission, options)
     ground = Ground(socket, wire, mission.agents, view, mission.parameters)
     ground.listen()
-    with page_of(ground).serving() as address:
-        where = f"the ground station is at {address}"
+    with contextlib.ExitStack() as pages:
+        page = page_of(ground)
+        where = f"the ground station is at {pages.enter_context(page.serving())}"
+        if options.phone:
+            phone = pages.enter_context(page.serving_others())
+            where += f", and phones see and stop at {phone}"
         print(f"echelon-flight: {where}. Ctrl-C quits.", file=sys.stderr, flush=True)
         with contextlib.suppress(KeyboardInterrupt):
             while True:

@@ -190,11 +190,28 @@ class Ground:
             "leader": None if report.leader == NOBODY else report.leader,
             "time": _number(report.time, 2),
             "place": [_number(x, 2) for x in (report.x, report.y, report.z)],
+            "nearest": self._nearest(number),
             "heard": _number(report.heard, 3),
+            "rate": _number(1.0 / report.step, 1) if report.step > 0.0 else None,
             "tick": _number(1e3 * report.tick, 2),
             "battery": _number(report.battery, 2),
             "dropped": [f"{n} × {why.value}" for why, n in counts if n],
         }
+
+    def _nearest(self, number: int) -> tuple[float | None, int] | None:
+        """Return how far the nearest agent is by the last reports, m, and who; None for nobody."""
+        places = {k: (r.x, r.y, r.z) for k in range(self._agents) if (r := self.report(k))}
+        own = places.pop(number, None)
+        away = [] if own is None else [(_apart(own, there), k) for k, there in places.items()]
+        far, who = min(away, default=(math.inf, NOBODY))
+        return (_number(far, 3), who) if math.isfinite(far) else None
+
+
+def _apart(a: tuple[float, ...], b: tuple[float, ...]) -> float:
+    """Return a distance; infinite where a place is not known. An axis that neither has is 0."""
+    gaps = [x - y for x, y in zip(a, b, strict=True) if not (math.isnan(x) and math.isnan(y))]
+    far = math.hypot(*gaps) if gaps else math.nan
+    return far if math.isfinite(far) else math.inf
 
 
 def _fault(report: Report) -> Fault:
@@ -217,13 +234,16 @@ def page_of(ground: Ground) -> type[Handler]:
             if self.path != "/state":
                 super().do_GET()
             elif self.allowed():
-                self.send(json.dumps(ground.state()).encode(), "application/json")
+                state = ground.state() | {"stops_only": bool(self.secret)}
+                self.send(json.dumps(state).encode(), "application/json")
 
         def do_POST(self) -> None:
-            """Start the plan, or stop everybody."""
+            """Start the plan, or stop everybody; from another machine stop alone."""
             if not self.allowed():
                 return
-            actions = {"/start": ground.start_soon, "/stop": ground.stop}
+            actions = {"/stop": ground.stop} | (
+                {} if self.secret else {"/start": ground.start_soon}
+            )
             action = actions.get(self.path)
             if action is not None:
                 try:

@@ -24,6 +24,9 @@ _Numbers = Annotated[
 ]
 _All = Annotated[bool, typer.Option("--all", help="Fly all agents, with simulated vehicles.")]
 _Ground = Annotated[bool, typer.Option("--ground", help="Serve the ground station's page.")]
+_Phone = Annotated[
+    bool, typer.Option("--phone", help="Let phones on the network see the page, and stop.")
+]
 _Ros = Annotated[
     bool, typer.Option("--ros2", help="Publish poses, goals and markers to ROS 2, from the ground.")
 ]
@@ -61,6 +64,7 @@ def fly(
     every: _All = False,
     ground: _Ground = False,
     dry_run: _Dry = False,
+    phone: _Phone = False,
     ros2: _Ros = False,
     link: _Link = "udp",
     key: _Key = None,
@@ -92,7 +96,8 @@ def fly(
         },
     }
     words = [str(word) for pair in given.items() if pair[1] is not None for word in pair]
-    flags = {"--all": every, "--ground": ground, "--dry-run": dry_run, "--ros2": ros2}
+    flags = {"--all": every, "--ground": ground, "--dry-run": dry_run}
+    flags |= {"--ros2": ros2, "--phone": phone}
     words += [flag for flag, is_set in flags.items() if is_set]
     STATUS.pause()
     sys.stdout.flush()
