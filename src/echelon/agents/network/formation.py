@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.distance_shapes import Distances, realize
 from echelon.agents.network.formation_motion import (
     FormationMotion,
     OffsetMotion,
@@ -39,6 +40,7 @@ class Formation:
         offsets: (N, n) float64; of a formation that moves, without its motion.
         motion: how they change with time; None for constant ones. `moving` returns a formation with
             one.
+        remarks: what should be known of a shape that was found, in sentences.
 
     Raises:
         FormationError: the offsets are not a finite matrix.
@@ -47,7 +49,7 @@ class Formation:
     def __init__(
         self, offsets: Sequence[Sequence[float]] | Array, motion: FormationMotion | None = None
     ) -> None:
-        self.motion = motion
+        self.motion, self.remarks = motion, tuple[str, ...]()
         self.offsets = np.array(offsets, dtype=np.float64)
         if self.offsets.ndim != 2 or not (np.abs(self.offsets) <= LARGEST).all():
             raise FormationError(
@@ -104,6 +106,41 @@ class Formation:
                 )
             full[agent] = _whole_state(model, agent, offset)
         return cls(full)
+
+    @classmethod
+    def from_distances(
+        cls,
+        model: ControlAffine,
+        graph: Graph,
+        distances: Distances,
+        near: Float[Array, "N d"] | None = None,
+    ) -> "Formation":
+        """Return a formation whose goals have given distances (paper, section on formations).
+
+        Its offsets are found once: they do not depend on seeds. A shape that is flexible, or not
+        the only one, is told of in `remarks`.
+
+        Args:
+            model: defines the position.
+            graph: defines the agents.
+            distances: (agent, agent) -> distance, m.
+            near: places (N, d), m, to which the shape is turned, and of two mirror images the
+                closer one is chosen; by default the leader's first neighbour in number lies on the
+                first axis.
+
+        Raises:
+            FormationError: the model has no position, or no shape has these distances, or none was
+                found.
+        """
+        axes = list(model.position_indices())
+        if not axes:
+            raise FormationError(f"`{type(model).__name__}` has no position, and so no distances.")
+        shape = realize(graph.agents, len(axes), distances, near)
+        offsets = np.zeros((graph.agents, len(model.state_names)))
+        offsets[:, axes] = shape.places - shape.places[graph.leaders[0]]
+        formation = cls(offsets)
+        formation.remarks = (*shape.remarks(),)
+        return formation
 
     @classmethod
     def triangle(cls, model: ControlAffine, graph: Graph, spacing: float = 1.0) -> "Formation":

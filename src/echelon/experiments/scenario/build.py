@@ -290,6 +290,10 @@ class _Builder:
         spec, starts = self.scenario.formation, self.scenario.initial.states
         formation = self._shape(spec)
         if spec.assign == "nearest":
+            if spec.distances is not None:
+                raise FormationError(
+                    "`assign: nearest` exchanges places, and `distances` are of agents by number."
+                )
             if not starts:
                 raise FormationError(
                     "`assign: nearest` needs `initial.states`: without them agents start about "
@@ -322,6 +326,15 @@ class _Builder:
         return Reshape(offsets, at, cast(float, spec.over), spec.assign == "nearest")
 
     def _shape(self, spec: ShapeKeys) -> Formation:
+        if spec.distances is not None:
+            pairs, n = {}, len(self.model.state_names)
+            for i, j, length in spec.distances:
+                pairs[i, j] = length
+            axes, starts = list(self.model.position_indices()), self.scenario.initial.states or {}
+            whole = [starts.get(k, ()) for k in range(self.graph.agents)]
+            known = all(len(state) == n for state in whole)
+            near = np.array(whole, float)[:, axes] if known else None
+            return Formation.from_distances(self.model, self.graph, pairs, near)
         if spec.name is None:
             return Formation.from_offsets(self.model, self.graph, spec.offsets or {})
         make, sizes = getattr(Formation, spec.name), {"spacing": spec.spacing}

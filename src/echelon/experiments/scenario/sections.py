@@ -178,10 +178,15 @@ class GraphSpec(Section, **either("edges", "name", "file")):
 class ShapeKeys(Section, abc.ABC):
     """The keys of a shape."""
 
-    one_of: ClassVar = ("name", "offsets")
+    one_of: ClassVar = ("name", "offsets", "distances")
     offsets: Annotated[dict[int, Numbers] | None, Unit("the position's, mostly m")] = None
     """Offset of each agent, as in `{1: [1, 0, 0]}`: a number for each coordinate of the position,
     usually m, or for each state; default 0."""
+    distances: Annotated[
+        list[Annotated[tuple[int, int, Positive], Field(strict=False)]] | None, Unit("m")
+    ] = None
+    """Distances between agents, as in `[[0, 1, 1.0], [1, 2, 0.8]]`, m; the shape that has them is
+    turned to `initial.states`, and the goals are stored."""
     name: Annotated[str, OneOf(registry.FORMATIONS)] | None = None
     """Name of a shape."""
     spacing: Annotated[Positive, Unit("m"), TakenBy(*registry.FORMATIONS)] = 1.0

@@ -78,7 +78,7 @@ def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
     model, graph, formation = parts.model, parts.graph, parts.formation
     # Gains, plans and starts are the same in a float32 run, and so is what is guaranteed of them.
     with precision("float64"):
-        warnings = check_model(model) + parts.world.check(model)
+        warnings = check_model(model) + parts.formation.remarks + parts.world.check(model)
         _check_offsets(model, parts)
         if to_store:
             # Before gains and plans, which may take long.
