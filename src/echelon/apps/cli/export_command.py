@@ -1,5 +1,6 @@
 """`echelon report`, `export` and `path`: a run, a law or a leader's path as a file."""
 
+import io
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -31,6 +32,7 @@ def report(
         Path | None, typer.Option(metavar="FILE.txt", help="Write it to this file instead.")
     ] = None,
     force: options.OverwriteOption = False,
+    as_latex: options.LatexOption = False,
 ) -> None:
     """Print the numbers of a run or flight, the conditions of its guarantee, and its versions."""
     if out is not None:
@@ -42,8 +44,18 @@ def report(
     from echelon.output.archive.run_folder import load, report_beside
     from echelon.output.reports.run_report import whole_report
 
-    recording = recording_of(load(run))
-    text = _beside(recording, beside) + whole_report(recording, report_beside(run))
+    loaded = load(run)
+    recording = recording_of(loaded)
+    if as_latex:
+        from echelon.experiments.results.metrics import metrics
+        from echelon.output.reports.latex import LatexConsole
+        from echelon.output.reports.run_report import print_report
+
+        told = io.StringIO()
+        print_report(LatexConsole(file=told), loaded, metrics(loaded))
+        text = told.getvalue().rstrip("\n")
+    else:
+        text = _beside(recording, beside) + whole_report(recording, report_beside(run))
     if out is None:
         print(text)
     else:

@@ -39,6 +39,7 @@ ForceOption = Annotated[
 ]
 GainFileOption = Annotated[Path | None, typer.Option("--out", help="Save the gain to this file.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
+LatexOption = Annotated[bool, typer.Option("--latex", help="Print tables as LaTeX.")]
 OverwriteOption = Annotated[bool, typer.Option("--force", help="Overwrite an existing file.")]
 PortOption = Annotated[
     int | None,

@@ -36,6 +36,7 @@ def check(
         int, typer.Option(min=1, help="Random starts at each scale, with `--region`.")
     ] = 200,
     as_json: JsonOption = False,
+    as_latex: options.LatexOption = False,
 ) -> None:
     """State what is guaranteed of a scenario, and why; exit code 0 if anything is."""
     from echelon.experiments.scenario.scenario import load_scenario
@@ -56,8 +57,8 @@ def check(
         from echelon.output.reports.check_report import check_report, check_sentences, grouped
         from echelon.output.reports.region_report import region_report
 
-        if every:
-            tables.print_statements(grouped(checked.lines), check_sentences(checked))
+        if every or as_latex:
+            tables.print_statements(grouped(checked.lines), check_sentences(checked), as_latex)
             if checked.region is not None:
                 print("\n" + region_report(checked.region))
         else:
@@ -124,6 +125,7 @@ def design(
         typer.Option("--slice", metavar="STATE,STATE", help="Draw the set in these two states."),
     ] = None,
     as_json: options.JsonOption = False,
+    as_latex: options.LatexOption = False,
 ) -> None:
     """Try all gain methods, recommend one, save its gain, and draw its guarantee."""
     from echelon.experiments.scenario.scenario import load_scenario
@@ -158,7 +160,7 @@ def design(
     if as_json:
         print(json.dumps(summary, indent=2))
     else:
-        tables.print_designs(summary["methods"], sentence)
+        tables.print_designs(summary["methods"], sentence, as_latex)
     raise typer.Exit(1 if best is None else 0)
 
 
@@ -190,6 +192,7 @@ def compare(
     force: options.ForceOption = False,
     figures: options.FiguresOption = True,
     as_json: options.JsonOption = False,
+    as_latex: options.LatexOption = False,
 ) -> None:
     """Simulate the consensus laws and the optimization-based methods from the same starts."""
     from echelon.experiments.scenario.scenario import load_scenario
@@ -209,7 +212,7 @@ def compare(
     folders = claim_folders([scenario.name for scenario in loaded], out, force)
     with STOP.hold():
         comparisons = [
-            _compare(*job, labels, figures, as_json)
+            _compare(*job, labels, figures, as_json, as_latex)
             for job in zip(loaded, experiments, folders, strict=True)
         ]
     if as_json:
@@ -225,6 +228,7 @@ def _compare(
     labels: tuple[str, ...],
     figures: bool,
     quiet: bool,
+    as_latex: bool,
 ) -> "Comparison":
     from echelon.experiments.studies.compare import compare as simulate
     from echelon.output.archive.study_folder import Flights, write_comparison
@@ -243,7 +247,7 @@ def _compare(
     comparison = simulate(scenario, experiment, labels, progress, flights.write)
     # Printed before anything more is written, so that a full disk loses nothing of it.
     if not quiet:
-        print_comparison(tables.console(), comparison)
+        print_comparison(tables.console(as_latex=as_latex), comparison)
     flights.check()
     rows, text = comparison_mapping(comparison), comparison_report(comparison)
     write_comparison(comparison, rows, text, folder, figures)

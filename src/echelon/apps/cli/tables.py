@@ -23,8 +23,12 @@ if TYPE_CHECKING:
     from echelon.synthesis.gains.gain import Gain
 
 
-def console(width: int = 200) -> "Console":
+def console(width: int = 200, as_latex: bool = False) -> "Console":
     """Return a console that keeps each row on one line where the output is no terminal."""
+    if as_latex:
+        from echelon.output.reports.latex import LatexConsole
+
+        return LatexConsole(width=width)
     from rich.console import Console
 
     # Wider than any table here, since `grep` and `awk` read lines.
@@ -114,9 +118,9 @@ _FOOTNOTES = (
 )
 
 
-def print_designs(rows: "list[JsonObject]", sentence: str) -> None:
+def print_designs(rows: "list[JsonObject]", sentence: str, as_latex: bool = False) -> None:
     """Print the methods as tables, the reasons of those without a gain, and a recommendation."""
-    out = console()
+    out = console(as_latex=as_latex)
     for part in _PARTS:
         out.print(_design_table(rows, ("method", *part)))
     notes = [*_FOOTNOTES] if any(row.get("coupling") for row in rows) else []
@@ -146,9 +150,11 @@ def _cell(value: object, towards: tuple[Callable[[float], str], ...]) -> str:
     return "-" if value is None else str(value)
 
 
-def print_statements(groups: "Mapping[str, Iterable[Statement]]", sentences: Iterable[str]) -> None:
+def print_statements(
+    groups: "Mapping[str, Iterable[Statement]]", sentences: Iterable[str], as_latex: bool = False
+) -> None:
     """Print sentences and all statements, each on one line where the output is no terminal."""
-    out = console()
+    out = console(as_latex=as_latex)
     flat = not out.is_terminal
     for sentence in sentences:
         out.print(sentence, highlight=False, markup=False, soft_wrap=flat)
