@@ -8,6 +8,7 @@ obeys `cmd_vel`, 100 times a second until its standard input ends, and prints wh
 
 import json
 import math
+import os
 import sys
 import threading
 import time
@@ -135,7 +136,7 @@ def quality(*more):
 
 
 def entities(name, kind, output):
-    world = DomainParticipant(0)
+    world = DomainParticipant(int(os.environ.get("ROS_DOMAIN_ID", "0")))
     message, topic = (Pose, "pose") if kind == "pose" else (Odom, "odom")
     best = quality(Policy.Reliability.BestEffort)
     out = DataWriter(world, Topic(world, f"rt/{name}/{topic}", message), qos=best)

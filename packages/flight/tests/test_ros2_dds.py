@@ -7,6 +7,7 @@ rules of CDR (formal/02-06-51, 15.3), and with those of the independent serializ
 """
 
 import contextlib
+import itertools
 import json
 import math
 import os
@@ -138,10 +139,18 @@ def test_a_velocity_of_the_world_is_sent_in_the_frame_of_the_robot():
 # ---- nodes in other processes --------------------------------------------------------------------
 
 
+COUNT = itertools.count()
+
+
+def domain():
+    return int(os.environ["ROS_DOMAIN_ID"])
+
+
 @pytest.fixture(autouse=True)
 def loopback(monkeypatch):
+    """A domain of its own for each test: others see a node that has ended for a while."""
     monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
-    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(1 + (31 * os.getpid() + next(COUNT)) % 200))
 
 
 @contextlib.contextmanager
@@ -183,7 +192,7 @@ def test_a_crazyflie_of_crazyswarm2_is_read_and_obeys():
 
 def test_poses_that_are_none_are_left_out_or_refused():
     """By a participant of this process, whose messages a test chooses."""
-    world = DomainParticipant(0)
+    world = DomainParticipant(domain())
     topic, inputs = Topic(world, "rt/cf3/pose", Pose), Topic(world, "rt/cf3/cmd_full_state", Full)
     out, _reader = DataWriter(world, topic), DataReader(world, inputs)
     link = open_link("ros2://cf3", facts(*DOUBLE))
@@ -222,7 +231,9 @@ def test_a_ground_robot_with_odometry_is_read_and_obeys():
 
 def test_what_no_node_serves_is_one_sentence(monkeypatch):
     soon = facts(*DOUBLE, ros2_patience=0.3)
-    with pytest.raises(FlightError, match="no node publishes `/cf1/pose` in ROS domain 0"):
+    with pytest.raises(
+        FlightError, match=f"no node publishes `/cf1/pose` in ROS domain {domain()}"
+    ):
         open_link("ros2://cf1", soon)
     with node(name="cf2"):
         with pytest.raises(
@@ -248,7 +259,7 @@ def test_the_ground_station_publishes_poses_goals_and_markers():
     offsets = {"every": 0.1, "rows": [[[0.0, 0.0, 0.0], [0.6, 0.0, 0.0]]]}
     facts = {"agents": 2, "leader": 0, "position": [0, 1, 2], "offsets": offsets}
     world, topics = (
-        DomainParticipant(0),
+        DomainParticipant(domain()),
         ["agent0/pose", "agent0/goal", "agent1/pose", "agent1/goal"],
     )
     readers = [DataReader(world, Topic(world, f"rt/echelon/{name}", Pose)) for name in topics]
