@@ -182,7 +182,10 @@ class NativeStepper(Stepper):
         if not self.varying.count:
             memory = jax.tree.map(np.asarray, begin_many(self.loop, by_formation).memory)
             leaves = (memory.laws, memory.sensing, memory.plant)
-            memory = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), leaves)
+            # The count is stated, since of an empty memory NumPy cannot find it.
+            memory = jax.tree.map(
+                lambda leaf: leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:]), leaves
+            )
             return self._rows_of(*memory)
         pairs = zip(self.loops, by_formation, strict=True)
         all_ = [begin(loop, jnp.asarray(x)).memory for loop, x in pairs]
