@@ -179,8 +179,7 @@ class Ground:
         if heard is None or report is None:
             return {"agent": number, "mode": "not heard yet", "notes": self._noted(number)}
         silent = time.monotonic() - heard
-        fault = _fault(report)
-        counts = zip(Drop, report.dropped, strict=True)
+        fault, counts = _fault(report), zip(Drop, report.dropped, strict=True)
         return {
             "agent": number,
             "mode": _MODES[min(report.mode, 2)] if silent < self._silence else "silent",

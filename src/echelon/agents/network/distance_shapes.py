@@ -90,16 +90,7 @@ def realize(
     if fault:
         raise FormationError(f"no shape in {axes} dimensions has these distances: {fault}.")
     search, size = _search(agents, axes, pairs, lengths), float(lengths.max())
-    ends = list[tuple[Array, float]]()
-    for end in search:
-        ends.append(end)
-        if end[1] <= _REALIZED * size:
-            break
-    first, residual = min(ends, key=lambda end: end[1])
-    if residual > _REALIZED * size:
-        raise FormationError(
-            f"no shape with these distances was found: the best one is off by {about(residual)} m."
-        )
+    first, residual = _first(search, _REALIZED * size)
     flat, rigid = _rank_of(first) < axes, _is_rigid(first, pairs)
     unique = True if len(pairs) == agents * (agents - 1) // 2 else None if flat else rigid
     if unique and rigid:
@@ -110,6 +101,18 @@ def realize(
         same = [places for places, off in search if off <= _REALIZED * size]
         others = tuple(_distinct([first, *same], size)[1:])
     return DistanceShape(_turned(first, near), residual, rigid, unique, not flat, others)
+
+
+def _first(search: Iterator[tuple[Array, float]], bound: float) -> tuple[Array, float]:
+    """Return the first places of a search that are off by a bound (m) at most, and by how much."""
+    least = np.inf
+    for places, off in search:
+        if off <= bound:
+            return places, off
+        least = min(least, off)
+    raise FormationError(
+        f"no shape with these distances was found: the best one is off by {about(least)} m."
+    )
 
 
 def _checked(agents: int, distances: Distances) -> tuple[Array, Array]:
@@ -193,13 +196,11 @@ def _search(agents: int, axes: int, pairs: Array, lengths: Array) -> Iterator[tu
         rows[each, i], rows[each, j] = apart, -apart
         return rows.reshape(len(i), -1)
 
-    for k in range(_STARTS):
-        start = draws.normal(size=(agents, axes)) * size
-        if not k:
-            start = _scaled(agents, axes, pairs, lengths)
-        tight = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-15, "max_nfev": 400}
-        end = scipy.optimize.least_squares(off, start.reshape(-1), slope, x_scale="jac", **tight).x
-        places = end.reshape(agents, axes)
+    tight = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-15, "max_nfev": 400, "x_scale": "jac"}
+    drawn = (draws.normal(size=(agents, axes)) * size for _ in range(_STARTS))
+    for start in itertools.chain([_scaled(agents, axes, pairs, lengths)], drawn):
+        end = scipy.optimize.least_squares(off, start.reshape(-1), slope, **tight)
+        places = end.x.reshape(agents, axes)
         apart = np.linalg.norm(places[i] - places[j], axis=1)
         yield places - places[0], float(np.abs(apart - lengths).max())
 

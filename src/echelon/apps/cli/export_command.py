@@ -44,22 +44,25 @@ def report(
     from echelon.output.archive.run_folder import load, report_beside
     from echelon.output.reports.run_report import whole_report
 
-    loaded = load(run)
-    recording = recording_of(loaded)
-    if as_latex:
-        from echelon.experiments.results.metrics import metrics
-        from echelon.output.reports.latex import LatexConsole
-        from echelon.output.reports.run_report import print_report
-
-        told = io.StringIO()
-        print_report(LatexConsole(file=told), loaded, metrics(loaded))
-        text = told.getvalue().rstrip("\n")
-    else:
-        text = _beside(recording, beside) + whole_report(recording, report_beside(run))
+    recording = recording_of(load(run))
+    text = _beside(recording, beside) + whole_report(recording, report_beside(run))
+    text = _latex(run) if as_latex else text
     if out is None:
         print(text)
     else:
         write_file(out, text + "\n")
+
+
+def _latex(run: Path) -> str:
+    """Return the report of a run with its tables as LaTeX."""
+    from echelon.experiments.results.metrics import metrics
+    from echelon.output.archive.run_folder import load
+    from echelon.output.reports.latex import LatexConsole
+    from echelon.output.reports.run_report import print_report
+
+    loaded, told = load(run), io.StringIO()
+    print_report(LatexConsole(file=told), loaded, metrics(loaded))
+    return told.getvalue().rstrip("\n")
 
 
 def _beside(flown: "Recording", run: Path | None) -> str:

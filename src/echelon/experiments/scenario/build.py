@@ -287,21 +287,10 @@ class _Builder:
         return reference
 
     def _formation(self) -> Formation:
-        spec, starts = self.scenario.formation, self.scenario.initial.states
+        spec = self.scenario.formation
         formation = self._shape(spec)
         if spec.assign == "nearest":
-            if spec.distances is not None:
-                raise FormationError(
-                    "`assign: nearest` exchanges places, and `distances` are of agents by number."
-                )
-            if not starts:
-                raise FormationError(
-                    "`assign: nearest` needs `initial.states`: without them agents start about "
-                    "their own places."
-                )
-            n = len(self.model.state_names)
-            whole = {agent: state for agent, state in starts.items() if len(state) == n}
-            formation = formation.nearest(self.model, self.graph, whole)
+            formation = self._nearest(formation)
         changes = list[OffsetMotion | Reshape]()
         for k, change in enumerate(spec.motion):
             with self.at("formation", "motion", k):
@@ -309,6 +298,22 @@ class _Builder:
         # Of a motion with faults, which are noted, nothing else is said.
         complete = changes and len(changes) == len(spec.motion)
         return formation.moving(self.model, self.graph, changes) if complete else formation
+
+    def _nearest(self, formation: Formation) -> Formation:
+        """Return a formation whose places are exchanged by `assign: nearest`."""
+        starts = self.scenario.initial.states
+        if self.scenario.formation.distances is not None:
+            raise FormationError(
+                "`assign: nearest` exchanges places, and `distances` are of agents by number."
+            )
+        if not starts:
+            raise FormationError(
+                "`assign: nearest` needs `initial.states`: without them agents start about "
+                "their own places."
+            )
+        n = len(self.model.state_names)
+        whole = {agent: state for agent, state in starts.items() if len(state) == n}
+        return formation.nearest(self.model, self.graph, whole)
 
     def _change(self, spec: MotionSpec) -> OffsetMotion | Reshape:
         if spec.rotate is not None:
