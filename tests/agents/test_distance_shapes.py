@@ -145,3 +145,19 @@ def test_a_scenario_keeps_its_distances_whatever_the_seed(tmp_path):
             assert np.linalg.norm(p[i] - p[j]) == pytest.approx(length, abs=1e-2)
         assert any("leave the shape flexible" in text for text in result.warnings)
     np.testing.assert_array_equal(*shapes)
+
+
+def test_the_starts_of_a_scenario_choose_heading_and_mirror_image(tmp_path):
+    file = tmp_path / "own.yaml"
+    lines = ["name: own", "model: {name: double-integrator, parameters: {dimension: 2}}"]
+    lines += ["graph: {edges: [[0, 1], [1, 2]]}", "leader: {law: passive}"]
+    lines += ["formation: {distances: [[0, 1, 1.0], [1, 2, 1.0], [0, 2, 1.2]]}"]
+    lines += ["simulation: {horizon: 8, dt: 0.02}"]
+    lines += ["initial: {states: {0: [0, 0, 0, 0], 1: [0, 2, 0, 0], 2: [-1, 1, 0, 0]}}"]
+    file.write_text("\n".join(lines))
+    parts, _ = ech.build(ech.load_scenario(file))
+    p = parts.formation.offsets[:, :2]
+    across = (p[1] - p[0])[0] * (p[2] - p[0])[1] - (p[1] - p[0])[1] * (p[2] - p[0])[0]
+    assert p[1][1] > 0.8 and across > 0.5
+    with pytest.raises(ech.EchelonError, match="`distances` are of agents by number"):
+        ech.build(ech.load_scenario(file, ["formation.assign=nearest"]))

@@ -7,7 +7,7 @@ rank N - d - 1 (Connelly 2005; Gortler, Healy and Thurston 2010).
 
 import itertools
 from collections.abc import Iterator, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.optimize
@@ -157,8 +157,10 @@ def _contradiction(agents: int, axes: int, pairs: Array, lengths: Array) -> str:
         if values[0] < -_REALIZED * scale or (
             len(values) > axes and values[-axes - 1] > _SAME * scale
         ):
-            names = ", ".join(map(str, group[:-1]))
-            return f"no {len(group)} points have those among agents {names} and {group[-1]}"
+            *names, last = map(str, group)
+            return (
+                f"no {len(names) + 1} points have those among agents {', '.join(names)} and {last}"
+            )
     return ""
 
 
@@ -170,7 +172,7 @@ def _cliques(D: Array, most: int) -> Iterator[tuple[int, ...]]:
         if len(group) >= 3:
             yield group
         if len(group) < most:
-            for k in sorted(x for x in common if x > group[-1]):
+            for k in sorted(x for x in common if x > max(group)):
                 yield from grown((*group, k), common & near[k])
 
     for k in range(len(D)):
@@ -196,10 +198,11 @@ def _search(agents: int, axes: int, pairs: Array, lengths: Array) -> Iterator[tu
         rows[each, i], rows[each, j] = apart, -apart
         return rows.reshape(len(i), -1)
 
-    tight = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-15, "max_nfev": 400, "x_scale": "jac"}
+    given: Any = {"jac": slope, "x_scale": "jac", "max_nfev": 400}
+    given |= dict.fromkeys(("xtol", "ftol", "gtol"), 1e-15)
     drawn = (draws.normal(size=(agents, axes)) * size for _ in range(_STARTS))
     for start in itertools.chain([_scaled(agents, axes, pairs, lengths)], drawn):
-        end = scipy.optimize.least_squares(off, start.reshape(-1), slope, **tight)
+        end = scipy.optimize.least_squares(off, start.reshape(-1), **given)
         places = end.x.reshape(agents, axes)
         apart = np.linalg.norm(places[i] - places[j], axis=1)
         yield places - places[0], float(np.abs(apart - lengths).max())

@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, cast, final
 
+import numpy as np
+
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
 from echelon.agents.network.channel import Bursts, Network
