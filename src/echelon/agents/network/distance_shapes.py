@@ -22,6 +22,7 @@ _STARTS, _SEED = 40, 0
 """From where places are sought."""
 _SAME, _REALIZED, _FLAT = 1e-6, 1e-9, 1e-7
 """Of the largest distance: apart by less is the same; off by less is realized; thinner is flat."""
+_TIGHT = dict.fromkeys(("xtol", "ftol", "gtol"), 1e-15)
 _RANK = 1e-8
 """Relative, of a singular value."""
 _CLIQUES = 20_000
@@ -135,14 +136,15 @@ def _checked(agents: int, distances: Distances) -> tuple[Array, Array]:
 
 
 # ---- what cannot be ------------------------------------------------------------------------------
+# No distance is longer than a way over others, and the Gram matrix of points has no negative
+# eigenvalue and rank d at most (Cayley and Menger).
 
 
 def _contradiction(agents: int, axes: int, pairs: Array, lengths: Array) -> str:
     """Return a proof that no places have the distances; empty where none is found."""
-    D = np.full((agents, agents), np.inf)
+    D = np.zeros((agents, agents))
     D[pairs[:, 0], pairs[:, 1]] = D[pairs[:, 1], pairs[:, 0]] = lengths
-    np.fill_diagonal(D, 0.0)
-    ways = np.asarray(csgraph.shortest_path(np.where(np.isfinite(D), D, 0.0), directed=False))
+    ways = np.asarray(csgraph.shortest_path(D, directed=False))
     for (i, j), length in zip(pairs.tolist(), lengths.tolist(), strict=True):
         if length > ways[i, j] * (1.0 + _REALIZED):
             return (
@@ -153,7 +155,6 @@ def _contradiction(agents: int, axes: int, pairs: Array, lengths: Array) -> str:
         squares = D[np.ix_(group, group)] ** 2
         gram = 0.5 * (squares[1:, :1] + squares[:1, 1:] - squares[1:, 1:])
         values, scale = np.linalg.eigvalsh(gram), squares.max()
-        # Cayley and Menger: a Gram matrix has no negative eigenvalue, and rank d at most.
         if values[0] < -_REALIZED * scale or (
             len(values) > axes and values[-axes - 1] > _SAME * scale
         ):
@@ -166,7 +167,7 @@ def _contradiction(agents: int, axes: int, pairs: Array, lengths: Array) -> str:
 
 def _cliques(D: Array, most: int) -> Iterator[tuple[int, ...]]:
     """Yield groups of 3 to `most` agents, between all of which distances are given."""
-    near = [{*np.flatnonzero(np.isfinite(row) & (row > 0.0)).tolist()} for row in D]
+    near = [{*np.flatnonzero(row).tolist()} for row in D]
 
     def grown(group: tuple[int, ...], common: set[int]) -> Iterator[tuple[int, ...]]:
         if len(group) >= 3:
@@ -198,8 +199,7 @@ def _search(agents: int, axes: int, pairs: Array, lengths: Array) -> Iterator[tu
         rows[each, i], rows[each, j] = apart, -apart
         return rows.reshape(len(i), -1)
 
-    given: Any = {"jac": slope, "x_scale": "jac", "max_nfev": 400}
-    given |= dict.fromkeys(("xtol", "ftol", "gtol"), 1e-15)
+    given: Any = {"jac": slope, "x_scale": "jac", "max_nfev": 400, **_TIGHT}
     drawn = (draws.normal(size=(agents, axes)) * size for _ in range(_STARTS))
     for start in itertools.chain([_scaled(agents, axes, pairs, lengths)], drawn):
         end = scipy.optimize.least_squares(off, start.reshape(-1), **given)
