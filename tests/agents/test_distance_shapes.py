@@ -14,7 +14,7 @@ def all_pairs(agents):
 
 
 def lengths(places, pairs):
-    return {(i, j): float(np.linalg.norm(places[i] - places[j])) for i, j in pairs}
+    return [(i, j, float(np.linalg.norm(places[i] - places[j]))) for i, j in pairs]
 
 
 def table(places):
@@ -35,13 +35,13 @@ def drawn(seed):
 def test_drawn_distances_are_realized_and_a_unique_shape_is_the_drawn_one(seed):
     places, pairs = drawn(seed)
     found = realize(*places.shape, lengths(places, pairs))
-    for (i, j), length in lengths(places, pairs).items():
+    for i, j, length in lengths(places, pairs):
         assert np.linalg.norm(found.places[i] - found.places[j]) == pytest.approx(length, abs=1e-8)
     if found.unique:
         np.testing.assert_allclose(table(found.places), table(places), atol=1e-6)
     for other in found.others:
         assert np.abs(table(other) - table(found.places)).max() > 1e-6
-        for (i, j), length in lengths(places, pairs).items():
+        for i, j, length in lengths(places, pairs):
             assert np.linalg.norm(other[i] - other[j]) == pytest.approx(length, abs=1e-8)
 
 
@@ -91,32 +91,30 @@ def test_what_is_flat_is_decided_by_all_distances_alone():
 @pytest.mark.parametrize(
     ("distances", "axes", "told"),
     [
-        ({(0, 1): 1.0, (1, 2): 1.0, (0, 2): 3.0}, 2, "0 and 2 are 3 m apart, and a way over"),
-        (dict.fromkeys(all_pairs(4), 1.0), 2, "no 4 points have those among agents 0, 1, 2 and 3"),
+        ([(0, 1, 1.0), (1, 2, 1.0), (0, 2, 3.0)], 2, "0 and 2 are 3 m apart, and a way over"),
+        ([(*pair, 1.0) for pair in all_pairs(4)], 2, "among agents 0, 1, 2 and 3"),
         # Each triangle exists, and the tetrahedron does not.
-        ({(0, 1): 1.0, (0, 2): 1.0, (1, 2): 1.0, (0, 3): 0.51, (1, 3): 0.51, (2, 3): 0.51}, 3,
+        ([(0, 1, 1.0), (0, 2, 1.0), (1, 2, 1.0), (0, 3, 0.51), (1, 3, 0.51), (2, 3, 0.51)], 3,
          "no 4 points"),
-        ({(0, 0): 1.0}, 2, "between agents 0 and 0"),
-        ({(0, 9): 1.0}, 2, "between agents 0 and 9"),
-        ({(0, 1): -1.0}, 2, "is -1 m, and must be above 0"),
-        ({(0, 1): np.nan}, 2, "must be above 0"),
-        ({(0, 1): 1.0, (1, 0): 2.0}, 2, "two distances are given between agents 1 and 0"),
-        ({}, 2, "is empty"),
+        ([(0, 0, 1.0)], 2, "between agents 0 and 0"),
+        ([(0, 9, 1.0)], 2, "between agents 0 and 9"),
+        ([(0, 1, -1.0)], 2, "is -1 m, and must be above 0"),
+        ([(0, 1, np.nan)], 2, "must be above 0"),
+        ([(0, 1, 1.0), (1, 0, 2.0)], 2, "two distances are given between agents 1 and 0"),
+        ([], 2, "is empty"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_refused_with_the_reason(distances, axes, told):
     with pytest.raises(ech.errors.FormationError, match=told):
-        realize(
-            max([1, *(k for pair in distances if 9 not in pair for k in pair)]) + 1, axes, distances
-        )
+        realize(4, axes, distances)
 
 
 def test_a_shape_without_a_proof_against_it_is_said_not_to_be_found():
     # Five of six edges of a wheel that is too small for its rim, without a triangle that fails.
-    rim = {(k, (k + 1) % 5): 1.0 for k in range(5)}
-    spokes = {(k, 5): 0.8 for k in range(5)}
+    rim = [(k, (k + 1) % 5, 1.0) for k in range(5)]
+    spokes = [(k, 5, 0.8) for k in range(5)]
     with pytest.raises(ech.errors.FormationError, match="no shape with these distances was found"):
-        realize(6, 2, rim | spokes)
+        realize(6, 2, rim + spokes)
 
 
 @pytest.mark.parametrize("axes", [2, 3])
@@ -159,5 +157,19 @@ def test_the_starts_of_a_scenario_choose_heading_and_mirror_image(tmp_path):
     p = parts.formation.offsets[:, :2]
     across = (p[1] - p[0])[0] * (p[2] - p[0])[1] - (p[1] - p[0])[1] * (p[2] - p[0])[0]
     assert p[1][1] > 0.8 and across > 0.5
-    with pytest.raises(ech.EchelonError, match="`distances` are of agents by number"):
-        ech.build(ech.load_scenario(file, ["formation.assign=nearest"]))
+    again = "formation.motion=[{reshape: {distances: [[0, 1, 1.0], [1, 2, 1.0]]}, at: 2, over: 2}]"
+    parts, settings = ech.build(ech.load_scenario(file, [again]))
+    assert any("flexible" in text for text in ech.check(parts, settings).warnings)
+    nearest = again.replace("over: 2", "over: 2, assign: nearest")
+    for change in ("formation.assign=nearest", nearest):
+        with pytest.raises(ech.EchelonError, match="`distances` are of agents by number"):
+            ech.build(ech.load_scenario(file, [change]))
+
+
+def test_rounded_distances_are_refused_with_how_far_off_they_are():
+    # The diagonals of a square with sides of .8 m, to a millimetre.
+    square = [(0, 1, 0.8), (1, 2, 0.8), (2, 3, 0.8), (3, 0, 0.8), (0, 2, 1.131), (1, 3, 1.131)]
+    with pytest.raises(ech.errors.FormationError, match=r"found is off by 0\.000\d+ m"):
+        realize(4, 2, square)
+    with pytest.raises(ech.errors.FormationError, match="`near` must be 4 places of 2 finite"):
+        realize(4, 2, square[:5], np.zeros((4, 3)))

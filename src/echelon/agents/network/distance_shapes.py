@@ -6,8 +6,8 @@ rank N - d - 1 (Connelly 2005; Gortler, Healy and Thurston 2010).
 """
 
 import itertools
-from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import scipy.optimize
@@ -28,8 +28,11 @@ _RANK = 1e-8
 _CLIQUES = 20_000
 """Groups of agents, all of whose distances are given, that are looked at."""
 
-Distances = Mapping[tuple[int, int], float]
-"""m, of pairs of agents."""
+_ENTRIES = 10_000_000
+"""Of the rigidity matrix, at most."""
+
+Distances: TypeAlias = Sequence[tuple[int, int, float]]
+"""Of pairs of agents, m."""
 
 
 class DistanceShape(NamedTuple):
@@ -38,7 +41,8 @@ class DistanceShape(NamedTuple):
     Attributes:
         places: (N, d), m.
         residual: the largest difference of a distance, m.
-        rigid: whether no small motion keeps all distances, to first order.
+        rigid: whether every small motion that keeps these distances keeps those of all pairs, to
+            first order.
         unique: whether only mirror images have these distances; None where it is not decided.
         mirrored: whether the mirror image is another shape: not of points in a line or a plane.
         others: shapes with the same distances that were found, each (N, d).
@@ -83,19 +87,27 @@ def realize(
             the first axis, and so on.
 
     Raises:
-        FormationError: a pair is none; no shape has the distances, with the reason where one is
-            proved; or none was found.
+        FormationError: a pair is none; there are too many; `near` has another shape; no shape has
+            the distances, with the reason where one is proved; or none was found.
     """
     pairs, lengths = _checked(agents, distances)
+    if near is not None and (np.shape(near) != (agents, axes) or not np.isfinite(near).all()):
+        raise FormationError(f"`near` must be {agents} places of {axes} finite numbers.")
+    if len(pairs) * agents * axes > _ENTRIES:
+        raise FormationError(f"{len(pairs)} distances of {agents} agents are too many.")
+    search, size = _search(agents, axes, pairs, lengths), float(lengths.max())
     fault = _contradiction(agents, axes, pairs, lengths)
     if fault:
-        raise FormationError(f"no shape in {axes} dimensions has these distances: {fault}.")
-    search, size = _search(agents, axes, pairs, lengths), float(lengths.max())
+        least = about(min(off for _, off in search))
+        raise FormationError(
+            f"no shape in {axes} dimensions has these distances: {fault}. The closest one that was "
+            f"found is off by {least} m."
+        )
     first, residual = _first(search, _REALIZED * size)
     flat, rigid = _rank_of(first) < axes, _is_rigid(first, pairs)
-    unique = True if len(pairs) == agents * (agents - 1) // 2 else None if flat else rigid
-    if unique and rigid:
-        unique = _is_unique(first, pairs)
+    unique = None if flat else rigid and _is_unique(first, pairs)
+    if len(pairs) == agents * (agents - 1) // 2:
+        unique = True
     others = tuple[Array, ...]()
     if rigid and unique is False:
         # A generic shape whose stress does not decide may be the only one all the same.
@@ -120,7 +132,7 @@ def _checked(agents: int, distances: Distances) -> tuple[Array, Array]:
     if not distances:
         raise FormationError("`distances` is empty, and must name pairs of agents.")
     seen = dict[tuple[int, int], float]()
-    for (i, j), length in distances.items():
+    for i, j, length in distances:
         if i == j or not (0 <= i < agents and 0 <= j < agents):
             raise FormationError(
                 f"a distance is given between agents {i} and {j}, and must be between two of the "
@@ -238,13 +250,11 @@ def _rank_of(matrix: Array) -> int:
     return int((sizes > _FLAT * sizes[0]).sum())
 
 
-def _rigidity(places: Array, pairs: Array) -> Array:
-    """Return the rigidity matrix (E, N d), with rows of length about 1."""
+def rigidity_matrix(places: Float[Array, "N d"], pairs: Array) -> Float[Array, "E Nd"]:
+    """Return the derivative of half of the squared distances of pairs (E, 2) by the places."""
     i, j = pairs.T
     rows, each = np.zeros((len(i), *places.shape)), np.arange(len(i))
-    apart = places[i] - places[j]
-    apart /= np.linalg.norm(apart, axis=1).max()
-    rows[each, i], rows[each, j] = apart, -apart
+    rows[each, i], rows[each, j] = places[i] - places[j], places[j] - places[i]
     return rows.reshape(len(i), -1)
 
 
@@ -254,16 +264,16 @@ def _rank(matrix: Array) -> int:
 
 
 def _is_rigid(places: Array, pairs: Array) -> bool:
-    whole = np.array([*itertools.combinations(range(len(places)), 2)])
-    return _rank(_rigidity(places, pairs)) == _rank(_rigidity(places, whole))
+    """Tell whether distances of pairs fix to first order what those of all pairs do."""
+    # All pairs of points that span r dimensions have this rank, in whatever space they lie.
+    span = _rank_of(places)
+    return _rank(rigidity_matrix(places, pairs)) == span * len(places) - span * (span + 1) // 2
 
 
 def _is_unique(places: Array, pairs: Array) -> bool:
-    """Return whether a random stress has a matrix of rank N - d - 1, or all pairs are given."""
+    """Return whether a random stress has a matrix of rank N - d - 1."""
     agents, axes = places.shape
-    if len(pairs) == agents * (agents - 1) // 2:
-        return True
-    rows = _rigidity(places, pairs)
+    rows = rigidity_matrix(places, pairs)
     left, sizes, _ = np.linalg.svd(rows)
     stresses = left[:, (np.append(sizes, np.zeros(len(rows)))[: len(rows)] <= _RANK * sizes[0])]
     if not stresses.shape[1]:

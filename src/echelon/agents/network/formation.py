@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from echelon.agents.models.model import ControlAffine
-from echelon.agents.network.distance_shapes import Distances, realize
+from echelon.agents.network.distance_shapes import Distances, realize, rigidity_matrix
 from echelon.agents.network.formation_motion import (
     FormationMotion,
     OffsetMotion,
@@ -47,9 +47,12 @@ class Formation:
     """
 
     def __init__(
-        self, offsets: Sequence[Sequence[float]] | Array, motion: FormationMotion | None = None
+        self,
+        offsets: Sequence[Sequence[float]] | Array,
+        motion: FormationMotion | None = None,
+        remarks: tuple[str, ...] = (),
     ) -> None:
-        self.motion, self.remarks = motion, tuple[str, ...]()
+        self.motion, self.remarks = motion, remarks
         self.offsets = np.array(offsets, dtype=np.float64)
         if self.offsets.ndim != 2 or not (np.abs(self.offsets) <= LARGEST).all():
             raise FormationError(
@@ -115,7 +118,7 @@ class Formation:
         distances: Distances,
         near: Float[Array, "N d"] | None = None,
     ) -> "Formation":
-        """Return a formation whose goals have given distances (paper, section on formations).
+        """Return a formation whose goals have given distances (paper, Definition 3).
 
         Its offsets are found once: they do not depend on seeds. A shape that is flexible, or not
         the only one, is told of in `remarks`.
@@ -123,10 +126,9 @@ class Formation:
         Args:
             model: defines the position.
             graph: defines the agents.
-            distances: (agent, agent) -> distance, m.
+            distances: agent, agent and distance (m) of each pair, as in `[(0, 1, 1.0)]`.
             near: places (N, d), m, to which the shape is turned, and of two mirror images the
-                closer one is chosen; by default the leader's first neighbour in number lies on the
-                first axis.
+                closer one is chosen; by default agent by agent opens a new axis.
 
         Raises:
             FormationError: the model has no position, or no shape has these distances, or none was
@@ -138,9 +140,7 @@ class Formation:
         shape = realize(graph.agents, len(axes), distances, near)
         offsets = np.zeros((graph.agents, len(model.state_names)))
         offsets[:, axes] = shape.places - shape.places[graph.leaders[0]]
-        formation = cls(offsets)
-        formation.remarks = (*shape.remarks(),)
-        return formation
+        return cls(offsets, remarks=(*shape.remarks(),))
 
     @classmethod
     def triangle(cls, model: ControlAffine, graph: Graph, spacing: float = 1.0) -> "Formation":
@@ -229,9 +229,8 @@ class Formation:
         Raises:
             FormationError: the model has no position, or a change does not fit it or the others.
         """
-        return Formation(
-            self.offsets, FormationMotion.of(model, graph.leaders, self.offsets, changes)
-        )
+        motion = FormationMotion.of(model, graph.leaders, self.offsets, changes)
+        return Formation(self.offsets, motion, self.remarks)
 
     def nearest(
         self, model: ControlAffine, graph: Graph, starts: Mapping[int, Sequence[float]]
@@ -290,11 +289,7 @@ class Formation:
             raise FormationError(
                 f"`{type(model).__name__}` has no position, so rigidity has no meaning for it."
             )
-        p = self.offsets[:, axes]
-        matrix = np.zeros((len(graph.edges), *p.shape))
-        for row, (i, j) in enumerate(graph.edges):
-            matrix[row, i], matrix[row, j] = p[i] - p[j], p[j] - p[i]
-        return matrix.reshape(len(graph.edges), -1)
+        return rigidity_matrix(self.offsets[:, list(axes)], graph.edges)
 
     def is_rigid(self, model: ControlAffine, graph: Graph) -> bool:
         """Tell whether edge lengths fix the shape to first order (infinitesimal rigidity)."""

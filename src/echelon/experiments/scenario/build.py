@@ -158,6 +158,7 @@ class _Builder:
     def __init__(self, scenario: Scenario) -> None:
         """Build what all other parts need, whose faults they would report again."""
         self.scenario, self.faults = scenario, list[ScenarioFault]()
+        self.remarks = list[str]()
         numbers, window = scenario.simulation.model_dump(), scenario.report.steady_window
         self.settings = self.part(
             lambda: Settings(**numbers, seed=scenario.seed, steady_window=window), "simulation"
@@ -290,7 +291,7 @@ class _Builder:
 
     def _formation(self) -> Formation:
         spec = self.scenario.formation
-        formation = self._shape(spec)
+        formation = self._shape(spec, spec.assign)
         if spec.assign == "nearest":
             formation = self._nearest(formation)
         changes = list[OffsetMotion | Reshape]()
@@ -298,16 +299,14 @@ class _Builder:
             with self.at("formation", "motion", k):
                 changes.append(self._change(change))
         # Of a motion with faults, which are noted, nothing else is said.
-        complete = changes and len(changes) == len(spec.motion)
-        return formation.moving(self.model, self.graph, changes) if complete else formation
+        if changes and len(changes) == len(spec.motion):
+            formation = formation.moving(self.model, self.graph, changes)
+        # Of all shapes, those of reshapes too.
+        return Formation(formation.offsets, formation.motion, (*dict.fromkeys(self.remarks),))
 
     def _nearest(self, formation: Formation) -> Formation:
         """Return a formation whose places are exchanged by `assign: nearest`."""
         starts = self.scenario.initial.states
-        if self.scenario.formation.distances is not None:
-            raise FormationError(
-                "`assign: nearest` exchanges places, and `distances` are of agents by number."
-            )
         if not starts:
             raise FormationError(
                 "`assign: nearest` needs `initial.states`: without them agents start about "
@@ -329,19 +328,23 @@ class _Builder:
             raise FormationError(
                 f"got a reshape at {at:g} s, allowed is a time before the horizon, {horizon:g} s."
             )
-        offsets = self._shape(spec.reshape).offsets
+        offsets = self._shape(spec.reshape, spec.assign).offsets
         return Reshape(offsets, at, cast(float, spec.over), spec.assign == "nearest")
 
-    def _shape(self, spec: ShapeKeys) -> Formation:
+    def _shape(self, spec: ShapeKeys, assign: str) -> Formation:
         if spec.distances is not None:
-            pairs, n = {}, len(self.model.state_names)
-            for i, j, length in spec.distances:
-                pairs[i, j] = length
+            if assign == "nearest":
+                raise FormationError(
+                    "`assign: nearest` exchanges places, and `distances` are of agents by number."
+                )
+            n = len(self.model.state_names)
             axes, starts = list(self.model.position_indices()), self.scenario.initial.states or {}
             whole = [starts.get(k, ()) for k in range(self.graph.agents)]
             known = all(len(state) == n for state in whole)
             near = np.array(whole, float)[:, axes] if known else None
-            return Formation.from_distances(self.model, self.graph, pairs, near)
+            found = Formation.from_distances(self.model, self.graph, spec.distances, near)
+            self.remarks += found.remarks
+            return found
         if spec.name is None:
             return Formation.from_offsets(self.model, self.graph, spec.offsets or {})
         make, sizes = getattr(Formation, spec.name), {"spacing": spec.spacing}
