@@ -96,13 +96,8 @@ def realize(
     if len(pairs) * agents * axes > _ENTRIES:
         raise FormationError(f"{len(pairs)} distances of {agents} agents are too many.")
     search, size = _search(agents, axes, pairs, lengths), float(lengths.max())
-    fault = _contradiction(agents, axes, pairs, lengths)
-    if fault:
-        least = about(min(off for _, off in search))
-        raise FormationError(
-            f"no shape in {axes} dimensions has these distances: {fault}. The closest one that was "
-            f"found is off by {least} m."
-        )
+    if fault := _contradiction(agents, axes, pairs, lengths):
+        raise _impossible(axes, fault, min(off for _, off in search))
     first, residual = _first(search, _REALIZED * size)
     flat, rigid = _rank_of(first) < axes, _is_rigid(first, pairs)
     unique = None if flat else rigid and _is_unique(first, pairs)
@@ -114,6 +109,13 @@ def realize(
         same = [places for places, off in search if off <= _REALIZED * size]
         others = tuple(_distinct([first, *same], size)[1:])
     return DistanceShape(_turned(first, near), residual, rigid, unique, not flat, others)
+
+
+def _impossible(axes: int, fault: str, least: float) -> FormationError:
+    return FormationError(
+        f"no shape in {axes} dimensions has these distances: {fault}. The closest one that was "
+        f"found is off by {about(least)} m."
+    )
 
 
 def _first(search: Iterator[tuple[Array, float]], bound: float) -> tuple[Array, float]:
