@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+import scipy  # loads scipy.optimize when a shape is sought
 import scipy.sparse.csgraph as csgraph
 from jaxtyping import Float
 
@@ -198,8 +199,6 @@ def _cliques(D: Array, most: int) -> Iterator[tuple[int, ...]]:
 
 def _search(agents: int, axes: int, pairs: Array, lengths: Array) -> Iterator[tuple[Array, float]]:
     """Yield the places at which a search from some starts ends, and by how much they are off, m."""
-    from scipy.optimize import least_squares
-
     i, j = pairs.T
     size, draws = lengths.max(), np.random.default_rng(_SEED)
 
@@ -217,7 +216,7 @@ def _search(agents: int, axes: int, pairs: Array, lengths: Array) -> Iterator[tu
     given: Any = {"jac": slope, "x_scale": "jac", "max_nfev": 400, **_TIGHT}
     drawn = (draws.normal(size=(agents, axes)) * size for _ in range(_STARTS))
     for start in itertools.chain([_scaled(agents, axes, pairs, lengths)], drawn):
-        end = least_squares(off, start.reshape(-1), **given)
+        end = scipy.optimize.least_squares(off, start.reshape(-1), **given)
         places = end.x.reshape(agents, axes)
         apart = np.linalg.norm(places[i] - places[j], axis=1)
         yield places - places[0], float(np.abs(apart - lengths).max())
