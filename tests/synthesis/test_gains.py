@@ -176,13 +176,40 @@ def test_a_mode_that_no_input_moves_is_named_with_its_states(A, B, names, where)
         synthesize(models.Linear(A, B, names=list(names)), LINE, Riccati())
 
 
-@pytest.mark.parametrize(("reach", "seen"), [(1e-7, True), (1e-5, True), (1e-11, False)])
+@pytest.mark.parametrize(
+    ("reach", "seen"), [(1e-7, True), (1e-5, True), (1e-12, True), (0.0, False)]
+)
 def test_a_mode_that_an_input_moves_little_is_moved(reach, seen):
     A, B = np.diag([1.0, 2.0]), np.array([[1.0], [reach]])
     found = uncontrollable_modes(A, B)
     assert [s for s, _ in found] == ([] if seen else [2.0])
     for _, direction in found:
         assert np.abs(direction) == pytest.approx([0.0, 1.0], abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("A", "B"),
+    [
+        ([[0, 1], [0, 0]], [[0], [1e-9]]),
+        ([[0, 1], [1e6, 0]], [[0], [1]]),
+        ([[0, 1e5], [0, 0]], [[0], [1e-5]]),
+        ([[0, 1e9, 0], [0, 0, 1e-12], [0, 0, 0]], [[0], [0], [1e-7]]),
+    ],
+)
+def test_units_hide_no_input(A, B):
+    assert not uncontrollable_modes(np.array(A, float), np.array(B, float))
+
+
+@settings(deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), lost=st.integers(0, 3))
+def test_modes_that_no_input_moves_are_found_in_any_units(seed, lost):
+    random = np.random.default_rng(seed)
+    n, m = lost + int(random.integers(1, 4)), int(random.integers(1, 3))
+    A, B = random.standard_normal((n, n)), random.standard_normal((n, m))
+    A[:lost, lost:], B[:lost] = 0.0, 0.0
+    units = 10.0 ** random.uniform(-6, 6, n)
+    found = uncontrollable_modes(units[:, None] * A / units, units[:, None] * B)
+    assert len(found) == lost
 
 
 @pytest.mark.parametrize("units", [(1e-8, 1e-8), (1e8, 1e8), (1e-2, 1e-11), (1e3, 1e-8)])

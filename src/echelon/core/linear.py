@@ -20,6 +20,7 @@ _INTERVALS = 512  # of strengths at a time, each with a P of its own
 _DOUBLINGS = 40  # of the number of steps, over which errors must vanish
 _ENDED = 1e-9  # of what is left of an error then
 _ROUNDING = 16 * float(np.finfo(float).eps)  # of a norm, times a condition number
+_SCALINGS = 20  # each halves the decades by which rows and columns differ
 _AXIS = 64 * float(np.finfo(float).eps)  # of the fastest mode's rate, that of rounding
 
 
@@ -191,19 +192,36 @@ def symmetric_basis(n: int) -> np.ndarray:
 def uncontrollable_modes(A: np.ndarray, B: np.ndarray) -> list[tuple[complex, np.ndarray]]:
     """Return the eigenvalues of A that input B cannot move, each with its left eigenvector.
 
-    This is the PBH test: a mode counts as uncontrollable when the smallest singular value of
-    [s I - A, B] is below 1e-9 times the norm of the pair.
+    This is the PBH test, in any units: rows and columns of [s I - A, B] are scaled, which keeps
+    its rank, until their largest entries are 1. A mode counts as uncontrollable when the smallest
+    singular value is then below 1e-9.
     """
-    scale = max(float(np.linalg.norm(A, 2)), float(np.linalg.norm(B, 2)))
+    balanced = scipy.linalg.matrix_balance(A, permute=False)[0]
+    zero = 1e-9 * float(np.linalg.norm(balanced, 2))
     result = []
     for s in np.linalg.eigvals(A):
-        pencil = np.hstack([s * np.eye(len(A)) - A, B])
+        shifted = s * np.eye(len(A)) - A
+        # An eigenvalue is as exact as rounding lets it be.
+        shifted[np.diag(np.abs(np.diag(shifted)) <= zero)] = 0.0
+        pencil, rows = _equilibrated(np.hstack([shifted, B]))
         # u'[s I - A, B] = 0 for the last left singular vector u: a left eigenvector that B does not
         # see.
         left, singular, _ = np.linalg.svd(pencil)
-        if singular[-1] <= 1e-9 * scale:
-            result.append((complex(s), left[:, -1].conj()))
+        if singular[-1] <= 1e-9:
+            result.append((complex(s), left[:, -1].conj() * rows))
     return result
+
+
+def _equilibrated(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a matrix whose rows and columns have largest entries of 1, and the rows' scales."""
+    rows = np.ones(len(matrix))
+    for _ in range(_SCALINGS):
+        sizes = np.abs(matrix).max(axis=1)
+        sizes = 1.0 / np.sqrt(np.where(sizes > 0.0, sizes, 1.0))
+        across = np.abs(matrix).max(axis=0)
+        matrix = sizes[:, None] * matrix / np.sqrt(np.where(across > 0.0, across, 1.0))
+        rows *= sizes
+    return matrix, rows
 
 
 def observability_rank(A: np.ndarray, C: np.ndarray) -> int:

@@ -84,24 +84,14 @@ class Riccati(Method):
                 (named).
         """
         Q, R = weights_of(model, self.Q, self.R)
-        _check_stabilizable(model, linear, Q, R)
+        _check_stabilizable(model, linear)
         # P A + A'P - s P B R^-1 B'P = -Q - (s - 1) P B R^-1 B'P, never positive for s >= rho = 1.
         return Feedback(riccati(*linear, Q, R), R, rho=1.0)
 
 
-def _in_units(linear: Linearization, Q: Array, R: Array) -> tuple[Array, Array]:
-    """Return A and B in units in which a state, or an input, of one has a weight of one."""
-    x, u = (np.sqrt(np.where(np.diag(M) > 0.0, np.diag(M), 1.0)) for M in (Q, R))
-    return x[:, None] * linear.A / x, x[:, None] * linear.B / u
-
-
-def _check_stabilizable(model: ControlAffine, linear: Linearization, Q: Array, R: Array) -> None:
+def _check_stabilizable(model: ControlAffine, linear: Linearization) -> None:
     """Name the first mode that no input can move and that does not decay by itself."""
-    modes = uncontrollable_modes(*linear)
-    if modes and not uncontrollable_modes(*_in_units(linear, Q, R)):
-        # Only the units of the states make it seem so.
-        return
-    for eigenvalue, direction in modes:
+    for eigenvalue, direction in uncontrollable_modes(*linear):
         # A mode that decays needs no input: (A, B) need not be controllable.
         if eigenvalue.real >= 0.0:
             # The mode is a combination w'x; entries of the size of rounding are left out.
