@@ -5,6 +5,7 @@ import math
 import pytest
 from agent_scene import DT, Scene, letter
 
+from echelon_flight.coverage_watch import CoverageWatch
 from echelon_flight.links import Reading
 from echelon_flight.supervisor import Fault
 from echelon_flight.wire import GROUND, DatagramKind, Drop, Message, Report
@@ -86,6 +87,33 @@ def test_a_vehicle_that_says_nothing_is_not_taken_for_one_that_rests(scene, caps
     assert not scene.process.over()
     scene.rounds(60)
     assert scene.process.over()
+
+
+WATCHED = (
+    {"text": "an input is at a limit", "of": "u", "row": [2.0], "low": None, "high": 0.9},
+    {"text": "`x` is outside of the domain", "of": "x", "row": [1, 0], "low": -0.5, "high": 0.5},
+)
+
+
+@pytest.mark.parametrize(
+    ("u", "x", "why"),
+    [(0.4, 0.5, ""), (0.5, 0.6, WATCHED[0]["text"]), (0.4, 0.6, WATCHED[1]["text"])],
+)
+def test_the_first_broken_condition_of_the_guarantee_is_told_with_its_time(scene, u, x, why):
+    scene.process.watch = watch = CoverageWatch({"guarantee": {"watched": WATCHED}})
+    scene.link.x, scene.law.u = [x, 1.0], u
+    scene.start()
+    scene.link.x, now = [0.7, 1.0], scene.context.clock.now
+    scene.rounds(20)
+    assert watch.why == (why or WATCHED[1]["text"])
+    # Before the state changed, or by it.
+    assert (watch.lost <= now) == bool(why) and watch.lost <= now + 20.0 * DT
+
+
+def test_nothing_is_watched_of_a_claim_that_ignores_what_acts():
+    ignores = CoverageWatch({"guarantee": {"watched": WATCHED, "ignores": ["wind acts"]}})
+    assert math.isnan(ignores.lost) and ignores.why == "wind acts"
+    assert math.isnan(CoverageWatch({}).lost) and not ignores.look(0.0, [9.0], [9.0])
 
 
 def report(scene, number=1, earlier=0):

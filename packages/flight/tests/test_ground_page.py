@@ -30,7 +30,8 @@ def report(leader, fault=Fault.NONE, amount=0.0):
     number, mode = list(Fault).index(fault), 1 + (fault is not Fault.NONE)
     place = 1.0, -0.25, math.nan
     rest = 4.2, *place, 0.03, 2e-4, 0.01, 0.5
-    return Report(mode, number, leader, amount, *rest, dropped)
+    kept = (1.25, 3, "an input is at a limit") if fault is Fault.FENCE else (math.inf, 0, "")
+    return Report(mode, number, leader, amount, *rest, dropped, *kept, "cflib://radio://0/80/2M")
 
 
 SHOWN = (
@@ -42,6 +43,9 @@ SHOWN = (
     "12 × is not newer than the last one from its sender",
     "1, -0.25, ?",
     "50 %",
+    "kept",
+    "lost at 1.25 s: an input is at a limit",
+    "cflib://radio://0/80/2M: 3 setpoints late",
 )
 """Of the page, once all has arrived."""
 

@@ -46,16 +46,18 @@ def test_commands_and_reports_are_read_without_a_plan():
         opened = ground.open(agent.note(WALL, sentence), None, WALL)
         assert (opened.kind, opened.body) == (DatagramKind.NOTE, sentence[:120])
     counts = tuple(range(len(Drop)))
-    report = Report(1, 2, 0, 0.5, 3.0, 1.0, 2.0, 3.0, 0.25, 0.5, 0.01, math.nan, counts)
+    watched = 2.5, 7, "an input is at a limit", "cflib://radio://0/80/2M/E7E7E7E701"
+    report = Report(1, 2, 0, 0.5, 3.0, 1.0, 2.0, 3.0, 0.25, 0.5, 0.01, math.nan, counts, *watched)
     read = ground.open(agent.report(WALL, report), None, WALL).body
-    assert read[:3] == report[:3] and read.dropped == counts and math.isnan(read.battery)
+    assert read[:3] == report[:3] and math.isnan(read.battery)
+    assert read[12:] == (counts, *watched)
 
 
 def test_the_layout_is_the_one_that_is_documented():
     """Written by hand, so that programs in other languages find what docs/fly.md says."""
     datagram = wire(1).letter(letter())
     head = struct.unpack_from("<BB8sHQQId", datagram)
-    assert head == (3, 1, bytes.fromhex("ab" * 8), 1, BOOT, FLIGHT, 1, NOW)
+    assert head == (4, 1, bytes.fromhex("ab" * 8), 1, BOOT, FLIGHT, 1, NOW)
     assert struct.unpack_from("<5d", datagram, 40) == letter().row[1:]
 
 
@@ -66,7 +68,7 @@ def signed(
     stamp=NOW,
     count=1,
     boot=BOOT,
-    version=3,
+    version=4,
     flight=FLIGHT,
 ):
     """A datagram of somebody who has the key and knows the format."""
@@ -88,7 +90,7 @@ BAD = {
         signed(b""),
         signed(body_of(), DatagramKind.START),
     ],
-    Drop.VERSION: [signed(body_of(), version=1), signed(body_of(), version=2)],
+    Drop.VERSION: [signed(body_of(), version=k) for k in (1, 2, 3)],
     Drop.FORMATION: [wire(formation="cd" * 32).letter(letter())],
     Drop.SIGNATURE: [
         wire(key=b"other" * 8).letter(letter()),

@@ -183,7 +183,7 @@ def _context(
         raise
     # The start may have been said often while the link was opened.
     socket.skip()
-    rest = socket, wire, PlanClock(options.speed), mission.log(facts, address)
+    rest = socket, wire, PlanClock(options.speed), mission.log(facts, address), address
     return AgentContext(law, facts, mission.facts, link, *rest)
 
 

@@ -12,6 +12,7 @@ from types import ModuleType
 from typing import Any, Final, NamedTuple, final
 
 from echelon_flight import FlightError
+from echelon_flight.coverage_watch import CoverageWatch
 from echelon_flight.datagram_socket import Datagrams
 from echelon_flight.flight_log import FlightLog, Tick
 from echelon_flight.links import Link, Reading
@@ -88,6 +89,7 @@ class AgentContext(NamedTuple):
         wire: that signs for the agent.
         clock: of the plan.
         log: that is written; None where none is.
+        address: of the link, as the ground station shows it.
     """
 
     law: ModuleType
@@ -98,6 +100,7 @@ class AgentContext(NamedTuple):
     wire: Wire
     clock: PlanClock
     log: FlightLog | None = None
+    address: str = ""
 
 
 @final
@@ -112,6 +115,7 @@ class AgentProcess:
         context: likewise.
         supervisor: that has the last word.
         pilot: that runs the law.
+        watch: of the conditions of the guarantee.
     """
 
     def __init__(self, context: AgentContext, seconds: float = math.inf) -> None:
@@ -123,6 +127,7 @@ class AgentProcess:
         leadership = flight["leadership"] or {"backups": ()}
         ahead = self._limits["letter_ahead"]
         self.pilot = Pilot(context.law, context.facts, leadership["backups"], ahead)
+        self.watch = CoverageWatch(context.facts)
         self._reading: Reading | None = None
         self._began, self._ticked, self._fell = time.monotonic(), -math.inf, math.inf
         self._due, self._fault_logged = 0.0, False
@@ -226,6 +231,9 @@ class AgentProcess:
         supervisor.spend((time.thread_time() - began) * self.context.clock.speed / (1 + missed))
         supervisor.check(result.u, result.valid)
         flies = supervisor.fault is Fault.NONE
+        if flies and self.watch.look(t, reading.x, result.u):
+            lost = f"a condition of the guarantee is broken at {t:.2f} s: {self.watch.why}"
+            self._say(lost, "guarantee")
         said = flies and self._act(result.u, result.letter, t)
         self._log(t, reading, tuple(result.u) if flies else (), missed, said)
 
@@ -386,6 +394,10 @@ class AgentProcess:
             step=supervisor.step,
             battery=math.nan if battery is None else battery,
             dropped=self.context.wire.counts,
+            lost=self.watch.lost,
+            late=self.context.link.late,
+            why=self.watch.why,
+            link=self.context.address,
         )
         self._longest = 0.0
         self.context.socket.send(self.context.wire.report(time.time(), report))
@@ -403,7 +415,8 @@ class AgentProcess:
             sys.stderr.flush()
             if self.context.log is not None:
                 self.context.log.say(self.context.clock.now, sentence)
-            if key != "fault":
+            # The page has places of their own for these.
+            if key not in ("fault", "guarantee"):
                 self._notes.append(sentence)
 
     def _summary(self) -> str:

@@ -19,7 +19,7 @@ from typing import Final, NamedTuple, final
 from echelon_flight import FlightError
 from echelon_flight.parameters import DEFAULTS
 
-VERSION: Final = 3
+VERSION: Final = 4
 GROUND: Final = 0xFFFF
 """The number of the ground station as a sender."""
 ALL: Final = 0xFFFE
@@ -95,6 +95,11 @@ class Report(NamedTuple):
         step: the median of the last steps between states, s.
         battery: share that is left; NaN if it is not known.
         dropped: how many datagrams, in the order of `Drop`.
+        lost: when the first condition of the guarantee was broken, s of the plan; infinite while
+            all are kept, NaN where nothing is guaranteed.
+        late: how many setpoints were late.
+        why: which condition was broken.
+        link: the address of the vehicle; of both texts 48 bytes are sent.
     """
 
     mode: int
@@ -110,6 +115,10 @@ class Report(NamedTuple):
     step: float
     battery: float
     dropped: tuple[int, ...]
+    lost: float = math.nan
+    late: int = 0
+    why: str = ""
+    link: str = ""
 
 
 class Opened(NamedTuple):
@@ -126,8 +135,8 @@ class Opened(NamedTuple):
     body: "Message | Report | float | str | None"
 
 
-_FIELDS: Final = len(Report._fields) - 1
-_REPORT: Final = struct.Struct(f"<BBHdd{_FIELDS - 5}f{len(Drop)}I")
+_FIELDS: Final = Report._fields.index("dropped")
+_REPORT: Final = struct.Struct(f"<BBHdd{_FIELDS - 5}f{len(Drop)}IdI48s48s")
 _START: Final = struct.Struct("<HQd")
 _STOP: Final = struct.Struct("<HQ")
 _KNOWN: Final = struct.Struct("<QQ")
@@ -237,7 +246,9 @@ class Wire:
     def report(self, wall: float, report: Report) -> bytes:
         """Return the datagram of a report."""
         body = _KNOWN.pack(self.challenge, self.highest)
-        body += _REPORT.pack(*report[:-1], *report.dropped)
+        *numbers, dropped, lost, late, why, link = report
+        texts = why.encode(), link.encode()
+        body += _REPORT.pack(*numbers, *dropped, lost, min(late, 0xFFFFFFFF), *texts)
         return self._sign(DatagramKind.REPORT, wall, body)
 
     def note(self, wall: float, sentence: str) -> bytes:
@@ -350,10 +361,12 @@ class Wire:
         if kind in (DatagramKind.START, DatagramKind.STOP):
             return self._read_command(kind, text)
         if kind is DatagramKind.NOTE:
-            return text.rstrip(b"\0").decode(errors="ignore")
+            return _text(text)
         if kind is DatagramKind.REPORT:
             numbers = _REPORT.unpack_from(text, _KNOWN.size)
-            return Report(*numbers[:_FIELDS], dropped=numbers[_FIELDS:])
+            *dropped, lost, late, why, link = numbers[_FIELDS:]
+            rest = tuple(dropped), lost, late, _text(why), _text(link)
+            return Report(*numbers[:_FIELDS], *rest)
         return self._read_letter(sender, stamp, text)
 
     def _read_command(self, kind: DatagramKind, text: bytes) -> Drop | float | None:
@@ -378,6 +391,10 @@ class Wire:
         if max(map(abs, numbers), default=0.0) > LARGEST:
             return Drop.TOO_LARGE
         return Message(sender, (stamp, *numbers))
+
+
+def _text(padded: bytes) -> str:
+    return padded.rstrip(b"\0").decode(errors="ignore")
 
 
 def sender_of(datagram: bytes) -> int | None:

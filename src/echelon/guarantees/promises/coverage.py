@@ -1,17 +1,20 @@
 """Whether a finished run kept to the conditions of a guarantee."""
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from echelon.core.digits import about
-from echelon.core.types import Array
+from echelon.core.types import Array, JsonObject
 from echelon.core.words import Kind, Theorem
-from echelon.guarantees.promises.promise import Guarantee
+from echelon.guarantees.promises.promise import Guarantee, kept_on_disk
 from echelon.guarantees.promises.region import entered
+from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.result import Result
+from echelon.simulation.step.settings import Settings
 
 _EDGE = 1e-9  # relative; a state that rests on a bound has not left it
 
@@ -99,6 +102,63 @@ def first_exit(result: Result, promise: Guarantee) -> Exit | None:
     return min((one for one in exits if one is not None), default=None)
 
 
+def watched_by(parts: Parts, settings: Settings, agent: int) -> list[JsonObject] | None:
+    """Return what one agent can watch of the conditions that `covered` asks of a run; None of none.
+
+    Each is a `row` of the vector `of` (`x` or `u`), whose value is between `low` and `high` (None:
+    unbounded) while the condition that `text` denies is met.
+    """
+    box, model, watched = kept_on_disk(_box_of, parts, settings), parts.model, list[JsonObject]()
+    if box is None:
+        return None
+    if settings.limits and model.input_limits is not None:
+        rows, low, high = (np.asarray(part, float) for part in model.input_limits)
+        near = _EDGE * np.where(np.isfinite(high - low), high - low, 1.0)
+        texts = ["an input is at a limit"] * len(rows)
+        watched += _rows("u", texts, rows, low + near, high - near)
+    # A bound that the formation's motion moves is the narrowest of its times.
+    times = np.linspace(0.0, settings.horizon, 200)
+    trim, scale = model.trim, np.linalg.inv(np.asarray(model.input_scale, float))
+    about = {
+        "x": (np.eye(len(trim[0])), parts.formation.offsets_at(times)[:, agent] + trim[0]),
+        "u": (scale, (scale @ np.asarray(trim[1], float))[None]),
+    }
+    names = {"x": model.state_names, "u": model.input_names}
+    for of, sides in box.items() if agent in parts.graph.leaders or "u" not in box else ():
+        rows, at = about[of]
+        low, high = (np.asarray(side, float) for side in sides)
+        texts = [f"`{name}` is outside of the domain" for name in names[of]]
+        watched += _rows(of, texts, rows, low + at.max(axis=0), high + at.min(axis=0))
+    return watched
+
+
+def _box_of(promise: Guarantee) -> JsonObject | None:
+    """Return the domain of a claim, of states less their trim and of normalized inputs.
+
+    Without a domain it is empty, without a theorem None. One with inputs binds leaders alone.
+    """
+    if promise.theorem is None or promise.region is None:
+        return None if promise.theorem is None else {}
+    domain, local = promise.region.domain, promise.theorem is Theorem.T2
+    sides = {"x": (domain.lower, domain.upper)}
+    sides |= {"u": (domain.input_lower, domain.input_upper)} if local else {}
+    return {of: [x.tolist() for x in _widened(box)] for of, box in sides.items()}
+
+
+def _widened(box: tuple[Array, Array]) -> list[Array]:
+    """Return the bounds that a state at rest on one of them does not leave."""
+    return [bound + _EDGE * sign * np.abs(bound) for bound, sign in zip(box, (-1.0, 1.0))]
+
+
+def _rows(
+    of: str, texts: Sequence[str], rows: Array, low: Array, high: Array
+) -> Iterator[JsonObject]:
+    for text, row, *sides in zip(texts, rows.tolist(), low.tolist(), high.tolist(), strict=True):
+        bounds = [side if math.isfinite(side) else None for side in sides]
+        if bounds != [None, None]:
+            yield {"text": text, "of": of, "row": row, "low": bounds[0], "high": bounds[1]}
+
+
 def _extremes(result: Result) -> Float[Array, "E N k"]:
     """Return the lowest and highest states and inputs over all steps; none if all are stored."""
     low, high = result.sums.lowest, result.sums.highest
@@ -113,7 +173,7 @@ def _outside(
     result: Result, values: Array, box: tuple[Array, Array], who: list[int], names: tuple[str, ...]
 ) -> Exit | None:
     """Return the first of values (T + E, K, k), of frames and then of all steps, outside a box."""
-    low, high = (bound + _EDGE * sign * np.abs(bound) for bound, sign in zip(box, (-1.0, 1.0)))
+    low, high = _widened(box)
     out = np.argwhere((values < low) | (values > high))
     if not len(out):
         return None

@@ -9,8 +9,8 @@ import abc
 import dataclasses
 import importlib
 import math
-from collections.abc import Hashable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol, TypeAlias
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol, TypeAlias, TypeVar
 from weakref import WeakKeyDictionary
 
 from echelon.core.cache import load_or_compute
@@ -32,6 +32,7 @@ from echelon.simulation.engine.prepare import Prepared, prepare
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates.certificate import RegionCertificate
 
+_T = TypeVar("_T")
 REQUIRED = (
     Hypothesis.SYMMETRY,
     Hypothesis.SMOOTH,
@@ -334,13 +335,23 @@ def guarantee_data(parts: Parts, settings: Settings) -> dict[str, Any]:
     Raises:
         EchelonError: as `guarantee`.
     """
+    return kept_on_disk(Guarantee.as_mapping, parts, settings)
+
+
+def kept_on_disk(of: Callable[[Guarantee], _T], parts: Parts, settings: Settings) -> _T:
+    """Return a function's value of `guarantee`, from the disk cache if another process computed it.
+
+    Raises:
+        EchelonError: as `guarantee`.
+    """
     # All fields of the parts, but for two that are no plain values: by what they are made of.
     fields = [getattr(parts, field.name) for field in dataclasses.fields(parts)]
     formation, graph = parts.formation, parts.graph.before
     plain = [x for x in fields if not isinstance(x, type(formation) | type(graph))]
     links = graph.edges, graph.weights, graph.agents, graph.leaders, graph.directed, graph.schedule
     rest = formation.offsets, formation.motion, links, settings
-    return load_or_compute(lambda: guarantee(parts, settings).as_mapping(), __name__, plain, rest)
+    what = f"{of.__module__}.{of.__qualname__}"
+    return load_or_compute(lambda: of(guarantee(parts, settings)), what, plain, rest)
 
 
 def promises(parts: Parts, settings: Sequence[Settings], brief: bool = False) -> Promises:

@@ -21,6 +21,7 @@ from echelon.core.numerics import precision
 from echelon.core.trace import shared_traces
 from echelon.core.types import Array, JsonObject
 from echelon.core.words import MessageContent, Verdict
+from echelon.guarantees.promises.coverage import watched_by
 from echelon.guarantees.promises.promise import guarantee_data
 from echelon.laws.law import Travels
 from echelon.output.archive.folder import write_errors
@@ -52,7 +53,7 @@ _EXCLUDES = (
     "other steps than `dt`",
 )
 _STATED = ("verdict", "claim", "theorem", "kind", "start", "graphs", "premises", "numbers")
-_STATED += ("ignores", "covers_start", "until")
+_STATED += ("ignores", "covers_start", "until", "watched")
 """What law.json repeats of the guarantee of the formation."""
 _CURRENT = "late or lost messages: the guarantee assumes that `z` is of the current step"
 _LATE = "other networks than `network`"
@@ -76,7 +77,7 @@ def law_files(parts: Parts, settings: Settings, agent: int, formation: str) -> d
         "law.c": c_text(functions, single.values(), about),
         "law.h": header_text(functions, about, constants | _sizes(double)),
     }
-    stated = guarantee_data(parts, settings)
+    stated = guarantee_data(parts, settings) | {"watched": watched_by(parts, settings, agent)}
     return {**files, "law.json": _facts(own, double, constants, stated, files)}
 
 
@@ -205,7 +206,8 @@ def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, 
     agents, rule = parts.graph.agents, parts.leadership
     files, stated = dict[str, str](), guarantee_data(parts, settings)
     for k in range(agents):
-        law = python_law(parts, settings, k, formation, stated)
+        own = stated | {"watched": watched_by(parts, settings, k)}
+        law = python_law(parts, settings, k, formation, own)
         files |= {f"law-{k}/{name}": text for name, text in law.items()}
     facts = json.loads(files["law-0/law.json"])
     vehicles = _vehicles(parts, settings)

@@ -48,11 +48,13 @@ class Link(abc.ABC):
             `("roll", "pitch", "yaw_rate", "thrust")`; None for any.
         watchdog: whether the vehicle levels by itself when inputs no longer arrive.
         notice: what the ground should know of the link, a sentence without its full stop; or "".
+        late: how many inputs were late, and not sent.
     """
 
     inputs: ClassVar[tuple[str, ...] | None] = None
     watchdog: ClassVar[bool] = False
     notice: str = ""
+    late: int = 0
 
     @abc.abstractmethod
     def __init__(self, address: str, facts: Mapping[str, Any]) -> None:
