@@ -2,12 +2,14 @@
 
 import math
 
+import numpy as np
 import pytest
 from virtual_flight import LinkImpairment, VirtualFlight
 
 import echelon as ech
 from echelon.agents.network.formation_motion import Rotate
 from echelon.output.archive.flight_folder import flight_files, save_flight
+from echelon_flight.flight_log import read_log
 from echelon_flight.local_flight import place_errors
 from echelon_flight.supervisor import Fault
 
@@ -53,6 +55,35 @@ def test_a_formation_is_kept_over_a_radio_and_by_who_comes_back(folder, tmp_path
     assert max(row[1] for row in errors[killed:]) < 0.01
     flight.wait(lambda state: len(flight.ended) == 3)
     assert set(flight.ended.values()) == {Fault.END}
+
+
+def test_a_flight_in_which_nothing_is_late_is_its_own_simulation(tmp_path, monkeypatch):
+    """By the logs, state and input of every tick; a period of 1/64 s has no rounding in its sums."""
+    dt = 1.0 / 64.0
+    graph = ech.Graph([(0, 1), (1, 2)], directed=True)
+    places = ech.Formation.from_offsets(CARTS, graph, {1: (1.0, 0.0), 2: (1.0, 0.8)})
+    leader = ech.laws.StoppingLeader(reference=ech.references.Circle(rate=0.5))
+    drive = ech.Laws(leader, ech.laws.StoppingPoint())
+    # A letter is there one period after it was sent: the least of a run.
+    world = ech.World(network=ech.Network(rate=64.0, delay=dt))
+    parts = ech.Parts(CARTS, graph, places, drive, initial={"position": 0.3}, world=world)
+    settings = ech.Settings(horizon=3.0, dt=dt, substeps=2)
+    save_flight(flight_files(parts, settings, "carts"), tmp_path / "flight")
+    radio = LinkImpairment(dt, 0.0, 0.0)
+    flight = VirtualFlight(tmp_path / "flight", tmp_path / "key", monkeypatch, radio)
+    for k in range(3):
+        flight.start_agent(k, logs=True)
+    flight.take_off(0, 1, 2, soon=0.25 + dt / 2.0)
+    flight.fly(3.5)
+    run = ech.simulate(parts, settings)
+    ends = [flight.agents[k].context.log for k in range(3)]
+    for k, log in enumerate(ends):
+        log.close()
+        ticks = read_log(log.file).ticks[: len(run.times) - 1]
+        np.testing.assert_array_equal([tick.time for tick in ticks], run.times[:-1])
+        for ours, name in ((run.states, "x"), (run.inputs, "u")):
+            rows = np.array([getattr(tick, name) for tick in ticks])
+            np.testing.assert_allclose(rows, ours[: len(rows), k], rtol=0, atol=1e-9)
 
 
 @pytest.mark.slow

@@ -150,10 +150,10 @@ class VirtualFlight:
         if agent.context.log is not None:
             agent.context.log.close()
 
-    def take_off(self, *ready):
+    def take_off(self, *ready, soon=0.3):
         """Start the plan once some agents are ready, in all of which that is so soon."""
         self.wait(lambda state: all(state["agents"][k]["mode"] == "ready" for k in ready))
-        self.ground.start(self.clock.time() + 0.3)
+        self.ground.start(self.clock.time() + soon)
 
     def wait(self, holds, seconds=30.0):
         """Fly until the page shows something, and return what it shows."""
