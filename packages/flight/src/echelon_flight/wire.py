@@ -365,8 +365,9 @@ class Wire:
         if kind is DatagramKind.REPORT:
             numbers = _REPORT.unpack_from(text, _KNOWN.size)
             *dropped, lost, late, why, link = numbers[_FIELDS:]
-            rest = tuple(dropped), lost, late, _text(why), _text(link)
-            return Report(*numbers[:_FIELDS], *rest)
+            texts = {"why": _text(why), "link": _text(link)}
+            rest = {"dropped": tuple(dropped), "lost": lost, "late": late, **texts}
+            return Report(*numbers[:_FIELDS], **rest)
         return self._read_letter(sender, stamp, text)
 
     def _read_command(self, kind: DatagramKind, text: bytes) -> Drop | float | None:
