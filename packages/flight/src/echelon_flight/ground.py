@@ -193,12 +193,8 @@ class Ground:
             "heard": _number(report.heard, 3),
             "rate": _number(1.0 / report.step, 1) if report.step > 0.0 else None,
             "tick": _number(1e3 * report.tick, 2),
-            "battery": _number(report.battery, 2),
-            "link": report.link,
-            "late": report.late,
-            "guarantee": _guarantee(report),
-            "broken": math.isfinite(report.lost),
             "dropped": [f"{n} × {why.value}" for why, n in counts if n],
+            **_kept(report),
         }
 
     def _nearest(self, number: int) -> tuple[float | None, int] | None:
@@ -221,11 +217,13 @@ def _fault(report: Report) -> Fault:
     return list(Fault)[report.fault] if report.fault < len(Fault) else Fault.NONE
 
 
-def _guarantee(report: Report) -> str:
-    """Return whether a flight keeps to the conditions of its guarantee, in words."""
-    if math.isfinite(report.lost):
-        return f"lost at {report.lost:.2f} s: {report.why}"
-    return "none" + f": {report.why}" * bool(report.why) if math.isnan(report.lost) else "kept"
+def _kept(report: Report) -> dict[str, Any]:
+    """Return link, battery, and whether the conditions of the guarantee are kept, in words."""
+    broken = math.isfinite(report.lost)
+    text = "none" + f": {report.why}" * bool(report.why) if math.isnan(report.lost) else "kept"
+    text = f"lost at {report.lost:.2f} s: {report.why}" if broken else text
+    kept = {"guarantee": text, "broken": broken, "battery": _number(report.battery, 2)}
+    return {"link": report.link, "late": report.late, **kept}
 
 
 def _number(value: float, digits: int) -> float | None:

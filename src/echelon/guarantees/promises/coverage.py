@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from echelon.agents.models.model import ControlAffine
 from echelon.core.digits import about
 from echelon.core.types import Array, JsonObject
 from echelon.core.words import Kind, Theorem
@@ -108,14 +109,10 @@ def watched_by(parts: Parts, settings: Settings, agent: int) -> list[JsonObject]
     Each is a `row` of the vector `of` (`x` or `u`), whose value is between `low` and `high` (None:
     unbounded) while the condition that `text` denies is met.
     """
-    box, model, watched = kept_on_disk(_box_of, parts, settings), parts.model, list[JsonObject]()
+    box, model = kept_on_disk(_box_of, parts, settings), parts.model
     if box is None:
         return None
-    if settings.limits and model.input_limits is not None:
-        rows, low, high = (np.asarray(part, float) for part in model.input_limits)
-        near = _EDGE * np.where(np.isfinite(high - low), high - low, 1.0)
-        texts = ["an input is at a limit"] * len(rows)
-        watched += _rows("u", texts, rows, low + near, high - near)
+    watched = list(_limits_of(model)) if settings.limits else []
     # A bound that the formation's motion moves is the narrowest of its times.
     times = np.linspace(0.0, settings.horizon, 200)
     trim, scale = model.trim, np.linalg.inv(np.asarray(model.input_scale, float))
@@ -130,6 +127,14 @@ def watched_by(parts: Parts, settings: Settings, agent: int) -> list[JsonObject]
         texts = [f"`{name}` is outside of the domain" for name in names[of]]
         watched += _rows(of, texts, rows, low + at.max(axis=0), high + at.min(axis=0))
     return watched
+
+
+def _limits_of(model: ControlAffine) -> Iterator[JsonObject]:
+    if model.input_limits is not None:
+        rows, low, high = (np.asarray(part, float) for part in model.input_limits)
+        near = _EDGE * np.where(np.isfinite(high - low), high - low, 1.0)
+        texts = ["an input is at a limit"] * len(rows)
+        yield from _rows("u", texts, rows, low + near, high - near)
 
 
 def _box_of(promise: Guarantee) -> JsonObject | None:
