@@ -2,6 +2,8 @@
 
 The leaders rest at their trim, unless they react; nothing pushes, measures or loses at random. All
 else is what runs: laws, their memories, limits, motors, estimators, the ages of messages, plants.
+
+Where the trim moves, rest is motion with it: whoever and whatever moves by w dt in a step stays.
 """
 
 import dataclasses
@@ -17,6 +19,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.models.relative_equilibrium import moves, trim_at
 from echelon.agents.references.reference import LeaderPath
 from echelon.core.compiled import cached_jit, compiled_for_one_call
 from echelon.core.numerics import Field
@@ -38,9 +41,13 @@ from echelon.simulation.step.sequence import begin, step
 
 @final
 class RestingLeader(Law, Travels, Speaks):
-    """A leader that rests at its trim, as everybody expects, and says what a follower would."""
+    """A leader that rests at its trim, as everybody expects, and says what a follower would.
+
+    `ahead`: the time (s) by which it has moved with its trim at the beginning; None for a trim at rest.
+    """
 
     follower: Law
+    ahead: Array | None = None
     plans = True
 
     def init(self) -> Memory:
@@ -76,7 +83,7 @@ class RestingLeader(Law, Travels, Speaks):
         period: Scalar | float,
     ) -> Expected:
         """Return what it says at its trim, with the deviation."""
-        x = jnp.asarray(np.asarray(model.trim[0], float))
+        x = _trim_ahead(model, t, self.ahead)
         return Expected(deviation + self._said(model, x, jnp.zeros_like(x), self.begin(model, x)))
 
     def _said(self, model: ControlAffine, x: State, offset: State, memory: Memory) -> jax.Array:
@@ -86,12 +93,14 @@ class RestingLeader(Law, Travels, Speaks):
 
 @final
 class RestingPath(LeaderPath):
-    """A path that stays at the trim of the model."""
+    """A path that stays at the trim of the model, or moves with it."""
+
+    ahead: Array | None = None
 
     def follow(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:
         """Return the trim."""
-        x, u = (jnp.asarray(np.asarray(part, float)) for part in model.trim)
-        return x, u
+        u = jnp.asarray(np.asarray(model.trim[1], float))
+        return _trim_ahead(model, t, self.ahead), u
 
     def turns(self, model: ControlAffine) -> bool:
         """Tell that the heading stays."""
@@ -104,15 +113,21 @@ class RestingPath(LeaderPath):
         """Accept every model."""
 
 
-def resting_leader(parts: Parts) -> Law:
+def _trim_ahead(model: ControlAffine, t: Scalar, ahead: Array | None) -> State:
+    if ahead is None:
+        return jnp.asarray(np.asarray(model.trim[0], float))
+    return trim_at(model, t + ahead)
+
+
+def resting_leader(parts: Parts, answers: bool, ahead: Array | None) -> Law:
     """Return the leaders' law with its path at rest; at the trim where it does not react."""
     assert isinstance(parts.drive, Laws)
     leader = parts.drive.leader
-    if not reacts(parts):
-        return RestingLeader(parts.drive.follower)
+    if not answers:
+        return RestingLeader(parts.drive.follower, ahead)
     if reference_of(leader) is None:
         return leader
-    return dataclasses.replace(leader, reference=RestingPath())  # pyright: ignore
+    return dataclasses.replace(leader, reference=RestingPath(ahead))  # pyright: ignore
 
 
 def reacts(parts: Parts) -> bool:
@@ -124,20 +139,30 @@ def reacts(parts: Parts) -> bool:
 # ---- the loop ------------------------------------------------------------------------------------
 
 
-def resting_loop(prepared: Prepared, graph_row: int | None, steps: int) -> Loop:
+def resting_loop(
+    prepared: Prepared,
+    graph_row: int | None,
+    steps: int,
+    ahead: float = 0.0,
+    own: bool = False,
+) -> Loop:
     """Return the loop of a run at rest, for so many steps.
 
-    Of a graph that switches it has one of its rows alone, unless that is None.
+    Of a graph that switches it has one of its rows alone, unless that is None. Leaders whose trim
+    moves have done so for a time `ahead` (s). `own`: the leaders' law is theirs, if they react or
+    not.
     """
     parts, problem = prepared.parts, prepared.problem
     assert isinstance(parts.drive, Laws)
+    begun = np.asarray(ahead) if moves(parts.model) else None
     still = problem._replace(
         settings=problem.settings._replace(horizon=steps * problem.settings.dt),
         motion=problem.motion.still,
         sensors=problem.sensors.still,
         channel=None if problem.channel is None else problem.channel.still,
     )
-    loop = assemble(still, resting_leader(parts), parts.drive.follower)
+    leader = resting_leader(parts, own or reacts(parts), begun)
+    loop = assemble(still, leader, parts.drive.follower)
     loop = loop.replace(roster=Everybody())
     if graph_row is not None and isinstance(loop.graph, SwitchingLinks):
         loop = loop.replace(graph=Links(loop.graph.exchange.during(graph_row)))
@@ -320,7 +345,7 @@ _NUMBERS = 2_000_000
 
 
 def _moved(
-    loop: Loop, now: LoopState, free: Array, steps: Array
+    loop: Loop, now: LoopState, free: Array, steps: Array, drift: Array | None
 ) -> tuple[Callable[[jax.Array], jax.Array], int]:
     """Return where numbers (d,) are after some steps, and how many there are at most in a row."""
     rest = jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(now) if is_real(x)])
@@ -328,7 +353,8 @@ def _moved(
     def moved(values: jax.Array) -> jax.Array:
         start = with_reals(now, rest.at[free].set(values))
         end = jax.lax.fori_loop(0, steps, lambda _, now: step(loop, now), start)
-        return jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(end) if is_real(x)])[free]
+        after = jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(end) if is_real(x)])[free]
+        return after if drift is None else after - steps * drift[free]
 
     # As many rows at a time as memory takes.
     return moved, max(1, _NUMBERS // len(rest))
@@ -336,7 +362,13 @@ def _moved(
 
 @compiled_for_one_call
 def slopes_along(
-    loop: Loop, now: LoopState, free: Array, base: Array, directions: Array, steps: Array
+    loop: Loop,
+    now: LoopState,
+    free: Array,
+    base: Array,
+    directions: Array,
+    steps: Array,
+    drift: Array | None,
 ) -> tuple[jax.Array, jax.Array]:
     """Return where numbers are after some steps, and the derivative along directions, (K, d) each.
 
@@ -347,14 +379,17 @@ def slopes_along(
         base: (d,) their values, the same for all directions: only slopes are computed K times.
         directions: (K, d).
         steps: how many.
+        drift: (D,) by which all numbers move in a step at rest, which is left out; None for nothing.
     """
-    moved, rows = _moved(loop, now, free, steps)
+    moved, rows = _moved(loop, now, free, steps, drift)
     start = (jnp.asarray(base),)
     return jax.lax.map(lambda d: jax.jvp(moved, start, (d,)), directions, batch_size=rows)
 
 
 @compiled_for_one_call
-def values_after(loop: Loop, now: LoopState, free: Array, bases: Array, steps: Array) -> jax.Array:
+def values_after(
+    loop: Loop, now: LoopState, free: Array, bases: Array, steps: Array, drift: Array | None
+) -> jax.Array:
     """Return where numbers are after some steps from each of K values (K, d), likewise."""
-    moved, rows = _moved(loop, now, free, steps)
+    moved, rows = _moved(loop, now, free, steps, drift)
     return jax.lax.map(moved, bases, batch_size=rows)
