@@ -60,7 +60,7 @@ class Boat(ControlAffine):
     radius = 1.14
     state_groups = {"position": ("x", "y"), "velocity": ("u", "v")}
     heading = Heading("heading", (("x", "y"),))
-    weights = ((1.0, 1.0, 1.0, 0.1, 0.1, 0.1), (1.0, 1.0))
+    weights = ((2.0, 1.3, 18.0, 0.01, 0.03, 0.02), (1.0, 0.12))
 
     def __check_init__(self) -> None:
         """Check the parameters."""

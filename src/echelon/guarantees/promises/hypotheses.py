@@ -37,6 +37,7 @@ from echelon.guarantees.promises.case import GuaranteeInputs
 from echelon.guarantees.promises.leaders import apart
 from echelon.guarantees.promises.modes import modes
 from echelon.guarantees.promises.promise import Guarantee
+from echelon.guarantees.promises.turning_lag import turning_lag
 from echelon.laws.law import Law, Proves
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.drive import Controller
@@ -203,7 +204,12 @@ def _symmetric(case: GuaranteeInputs) -> Statement:
     if formation.motion is not None:
         text, remedy = "offsets change with time", "use the law `stopping-point`"
         reason = f"{text}, and the theorems about this law are of constant ones"
-        return fails(name, Kind.PROOF, text, remedy=remedy, reason=reason)
+        lag, unit = turning_lag(case), position_unit(model)
+        if lag is None:
+            return fails(name, Kind.PROOF, text, remedy=remedy, reason=reason)
+        text += f"; turning with the leader, followers end up to {at_least(lag)} {unit} off their goals"
+        number = lag, f"{at_least(lag)} {unit} off"
+        return fails(name, Kind.PROOF, text, *number, remedy=remedy, reason=reason)
     if not np.ptp(formation.offsets, axis=0).any():
         return unneeded(name, Kind.PROOF, "there are none")
     broken = formation.broken_symmetries(model)

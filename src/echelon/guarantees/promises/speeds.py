@@ -128,6 +128,8 @@ def speed_range(case: GuaranteeInputs) -> SpeedRange | None:
         return None
     high, above = _edge(fault, np.geomspace(1.0, _MOST, _UP))
     low, below = _edge(fault, np.linspace(1.0, -1.0, _DOWN))
+    # At 0 most vehicles cannot be steered, and rounding is left of it.
+    low = low if abs(low) > _ROUNDING else 0.0
     return SpeedRange(low * speed, high * speed, below, above)
 
 
@@ -195,7 +197,8 @@ def _compared(
     outside = np.flatnonzero(~((path.speeds >= low) & (path.speeds <= high)))
     slowest, fastest = path.speeds.min(), path.speeds.max()
     if not len(outside):
-        text += f"; the path moves at {about(slowest)} to {about(fastest)} {unit}"
+        sizes = dict.fromkeys(about(x) for x in (slowest, fastest))
+        text += f"; the path moves at {' to '.join(sizes)} {unit}"
         return holds(_NAME, Kind.LINEARIZATION, text, *number)
     first = outside[0]
     at = f"{about(path.speeds[first])} {unit} at {about(path.times[first])} s"

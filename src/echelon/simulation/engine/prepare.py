@@ -187,11 +187,11 @@ def _check_translations(model: ControlAffine, formation: Formation) -> None:
         if np.abs(away).max() > _KEPT:
             along = np.abs(away[list(path_states(model))])
             size = float(np.linalg.norm(along)) or float(np.abs(away).max())
-            unit = position_unit(model) if along.any() else ""
+            unit = f"{position_unit(model)}/s" if along.any() and model.position else "per second"
             names = [n for n, x in zip(model.state_names, offset, strict=True) if x]
             raise SimulationError(
                 f"the offset of agent {agent} in {listing(names)} separates it from the leader by "
-                f"{size:.3g} {unit}/s for ever, since the trim of `{type(model).__name__}` moves; "
+                f"{size:.3g} {unit} for ever, since the trim of `{type(model).__name__}` moves; "
                 "offset only what neither f nor g uses, such as positions."
             )
 
