@@ -36,7 +36,7 @@ from echelon.synthesis.gains.strings import string_growth
 
 _Word = TypeVar("_Word", bound=Word)
 _WATCHED, _MOMENTS, _STRAIGHT = 600.0, 2048, 1e-6
-"""s and times at which a path is looked at, and the sine of half an angle that is still straight."""
+"""s and times at which a path is looked at; sine of half an angle that is still straight."""
 
 
 def _member(key: str, kind: type[_Word]) -> Callable[[object], _Word]:

@@ -53,12 +53,6 @@ def trim_speed(model: ControlAffine) -> float:
     return float(np.linalg.norm(trim_velocity(model)))
 
 
-def trim_at(model: ControlAffine, times: jax.Array | Array) -> jax.Array:
-    """Return where an agent that begins at its trim and moves with it is at times (...)."""
-    rest, velocity = np.asarray(model.trim[0], float), trim_velocity(model)
-    return rest + jnp.asarray(times)[..., None] * velocity if velocity.any() else jnp.asarray(rest)
-
-
 def check_trim(model: ControlAffine, name: str) -> None:
     """Raise `ModelError` unless the trim rests, or moves along translations alone."""
     velocity = trim_velocity(model)
@@ -87,9 +81,7 @@ def is_translation(model: ControlAffine, k: int) -> bool:
     sizes = np.geomspace(1e-2, 1e6, _SHIFTS) * draw.choice([-1.0, 1.0], _SHIFTS)
     shift = sizes[:, None] * np.eye(len(trim))[k]
     with precision("float64"):
-        here, there = (
-            tuple(map(np.asarray, _told(model, x + s, y + s))) for s in (0.0 * shift, shift)
-        )
+        here, there = (map(np.asarray, _told(model, x + s, y + s)) for s in (0.0 * shift, shift))
     *same, (output, moved) = zip(here, there, strict=True)
     # A difference of states that were shifted far is rounded in their size.
     rounding = (1.0, 1.0, np.abs(sizes)[:, None])
@@ -113,7 +105,7 @@ def _told(
     return rows(f), rows(g), jax.vmap(model.difference)(x, y), rows(h)
 
 
-def separation(model: ControlAffine, offset: State) -> Array:
+def separation(model: ControlAffine, offset: Array) -> Array:
     """Return how fast an agent at the trim with an offset (n,) leaves one at the trim, (n,)."""
     with precision("float64"):
         x, u = (np.asarray(part, float) for part in model.trim)

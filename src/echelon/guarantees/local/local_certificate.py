@@ -24,6 +24,7 @@ from echelon.core.types import Array, PyTree
 from echelon.core.words import Feedforward, amount
 from echelon.guarantees.local.resting_loop import (
     BodyPlaces,
+    Span,
     begun,
     body_of,
     held_exactly,
@@ -143,20 +144,25 @@ def local_certificate(prepared: Prepared) -> LocalCertificate:
         timed = _timed(law, loop, parts.model, goals)
         if timed is not None:
             return LocalCertificate((timed[0],), culprit=timed[1])
-    now, drift = begun(loop, goals, np.asarray(settled)), None
-    if moves(parts.model):
-        bound = _bound_to_places(prepared, row, settled + 3 * period, goals)
-        if bound:
-            return LocalCertificate((Fault.PLACES,), culprit=bound)
-        drift = _drift(prepared, row, settled, period, goals)
-    rest = _rest_of(loop, now, _movers(parts, answer), period, parts.graph, drift, settled)
+    moving = _moving(prepared, row, settled, period, goals)
+    if isinstance(moving, str):
+        return LocalCertificate((Fault.PLACES,), culprit=moving)
+    now = begun(loop, goals, np.asarray(settled))
+    rest = _rest_of(loop, now, _movers(parts, answer), period, parts.graph, moving)
+    return _certified(prepared, rest, goals, period, row)
+
+
+def _certified(
+    prepared: Prepared, rest: "_Rest", goals: Array, period: int, row: int | None
+) -> LocalCertificate:
+    parts, channel = prepared.parts, prepared.problem.channel
     if not _leaders_rest(rest, period):
         return LocalCertificate((Fault.NO_REST,))
-    foreign = bool(parts.drive.unknown or own_members(loop))
+    foreign = bool(parts.drive.unknown or own_members(rest.loop))
     found = _judged(rest, goals, period, parts.model.state_names, foreign)
     if row and found.radius is not None:
         found = _until_last(prepared, rest, goals, found)
-    steady = problem.channel is None or problem.channel.steady
+    steady = channel is None or channel.steady
     return found._replace(period=period, steady=steady)
 
 
@@ -187,7 +193,7 @@ def _until_last(
         after = _less(rest, after, steps)
     else:
         after, slopes = _maps(early, np.eye(len(rest.value)), steps)
-    if not (np.abs(after - rest.value) <= _AT_REST * _scale(rest.value)).all():
+    if not (np.abs(after - value) <= _AT_REST * _scale(value)).all():
         return found._replace(faults=(Fault.NO_REST,), radius=None, map=None)
     if slopes is None:
         return found
@@ -290,6 +296,23 @@ _PLACES = (1.0, -37.0, 900.0)
 """s of motion by which a formation is shifted, and how far off its goals it is meanwhile."""
 
 
+class _Moving(NamedTuple):
+    """As in `_Rest`."""
+
+    drift: Array | None
+    since: int
+
+
+def _moving(
+    prepared: Prepared, row: int | None, settled: int, period: int, goals: Array
+) -> _Moving | str:
+    """Return how all moves at rest, or why that depends on where agents are, in words."""
+    if not moves(prepared.parts.model):
+        return _Moving(None, settled)
+    bound = _bound_to_places(prepared, row, settled + 3 * period, goals)
+    return bound or _Moving(_drift(prepared, row, settled, period, goals), settled)
+
+
 def _bound_to_places(prepared: Prepared, row: int | None, steps: int, goals: Array) -> str:
     """Return what differs if all begin elsewhere, in words; empty where nothing does."""
     model, rest = prepared.parts.model, []
@@ -300,16 +323,15 @@ def _bound_to_places(prepared: Prepared, row: int | None, steps: int, goals: Arr
         now = begun(loop, goals + _AWAY * draw + shift, np.asarray(steps))
         rest.append(np.asarray(now.states) - shift)
     gaps = np.abs(np.array(rest[1:]) - rest[0]).max(axis=(0, 1))
-    # Places far away are rounded, in each step.
-    if (gaps <= _AT_REST * steps).all():
+    # Places far away are rounded, in each step, and a loop that grows multiplies that.
+    off = np.abs(rest[0] - goals - steps * prepared.problem.settings.dt * trim_velocity(model))
+    if (gaps <= _AT_REST * steps * max(1.0, float(off.max()) / _AWAY)).all():
         return ""
     k = int(np.argmax(np.where(np.isfinite(gaps), gaps, np.inf)))
     return f"`{model.state_names[k]}` differs by {about(gaps[k])} after {amount(steps, 'step')}"
 
 
-def _drift(
-    prepared: Prepared, row: int | None, settled: int, period: int, goals: Array
-) -> Array:
+def _drift(prepared: Prepared, row: int | None, settled: int, period: int, goals: Array) -> Array:
     """Return by how much all numbers of a moment move in a step, (D,), where all are at rest."""
     ahead, moments = period * prepared.problem.settings.dt, []
     for time in (0.0, ahead):
@@ -387,13 +409,7 @@ class _Rest(NamedTuple):
 
 
 def _rest_of(
-    loop: Loop,
-    now: LoopState,
-    movers: Array,
-    period: int,
-    graph: Graph,
-    drift: Array | None,
-    since: int,
+    loop: Loop, now: LoopState, movers: Array, period: int, graph: Graph, moving: _Moving
 ) -> _Rest:
     """Return where everybody rests, looked for from a moment on, and the map about it."""
     body = body_of(loop, now)
@@ -405,7 +421,7 @@ def _rest_of(
     links = _links_of(loop, movers) if size and not len(shared) and period == 1 else None
     value, known = reals(now)[free], (None, None)
     rest = _Rest(loop, graph, now, body, free, value, np.inf, movers, links, size, *known)
-    rest = rest._replace(drift=drift, since=since)
+    rest = rest._replace(**moving._asdict())
     if len(free) > _DENSE:
         return rest if links is None else _split_at(_settled(rest), period)
     rest = _by_newton(rest, period)
@@ -414,7 +430,7 @@ def _rest_of(
 
 def _maps(rest: _Rest, directions: Array, period: int) -> tuple[Array, Array]:
     """Return the numbers (d,) a period later, and the derivative along directions (K, d)."""
-    rows = rest.free, rest.value, directions, np.asarray(period), rest.drift
+    rows = rest.free, rest.value, directions, Span(np.asarray(period), rest.drift)
     values, slopes = map(np.asarray, slopes_along(rest.loop, rest.now, *rows))
     return values[0], slopes
 
@@ -424,7 +440,8 @@ def _values(rest: _Rest, bases: Array, period: int) -> Array:
     # One shape, and so one program.
     count = max(_PROBES, len(bases))
     rows = np.concatenate([bases, np.tile(rest.value, (count - len(bases), 1))])
-    after = values_after(rest.loop, rest.now, rest.free, rows, np.asarray(period), rest.drift)
+    span = Span(np.asarray(period), rest.drift)
+    after = values_after(rest.loop, rest.now, rest.free, rows, span)
     return np.asarray(after)[: len(bases)]
 
 

@@ -60,7 +60,7 @@ def _repeats(parts: Parts, local: LocalCertificate) -> Statement:
 def _rests(parts: Parts, local: LocalCertificate) -> Statement:
     name = Hypothesis.REST
     if Fault.PLACES in local.faults:
-        text = f"the step depends on where agents are: shifted along the trim's motion, {local.culprit}"
+        text = f"the step depends on where agents are: shifted as the trim moves, {local.culprit}"
         remedy = "let laws use differences of positions alone"
         return fails(name, _LINEAR, text, remedy=remedy, reason=text)
     if Fault.NO_REST in local.faults:

@@ -19,7 +19,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
 from echelon.agents.models.model import ControlAffine
-from echelon.agents.models.relative_equilibrium import moves, trim_at
+from echelon.agents.models.relative_equilibrium import trim_velocity
 from echelon.agents.references.reference import LeaderPath
 from echelon.core.compiled import cached_jit, compiled_for_one_call
 from echelon.core.numerics import Field
@@ -43,11 +43,11 @@ from echelon.simulation.step.sequence import begin, step
 class RestingLeader(Law, Travels, Speaks):
     """A leader that rests at its trim, as everybody expects, and says what a follower would.
 
-    `ahead`: the time (s) by which it has moved with its trim at the beginning; None for a trim at rest.
+    `travel` (2, n): how far it is off its trim at first, and how fast that moves; None if it rests.
     """
 
     follower: Law
-    ahead: Array | None = None
+    travel: Array | None = None
     plans = True
 
     def init(self) -> Memory:
@@ -83,7 +83,7 @@ class RestingLeader(Law, Travels, Speaks):
         period: Scalar | float,
     ) -> Expected:
         """Return what it says at its trim, with the deviation."""
-        x = _trim_ahead(model, t, self.ahead)
+        x = _trim_at(model, t, self.travel)
         return Expected(deviation + self._said(model, x, jnp.zeros_like(x), self.begin(model, x)))
 
     def _said(self, model: ControlAffine, x: State, offset: State, memory: Memory) -> jax.Array:
@@ -95,12 +95,12 @@ class RestingLeader(Law, Travels, Speaks):
 class RestingPath(LeaderPath):
     """A path that stays at the trim of the model, or moves with it."""
 
-    ahead: Array | None = None
+    travel: Array | None = None
 
     def follow(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:
         """Return the trim."""
         u = jnp.asarray(np.asarray(model.trim[1], float))
-        return _trim_ahead(model, t, self.ahead), u
+        return _trim_at(model, t, self.travel), u
 
     def turns(self, model: ControlAffine) -> bool:
         """Tell that the heading stays."""
@@ -113,21 +113,21 @@ class RestingPath(LeaderPath):
         """Accept every model."""
 
 
-def _trim_ahead(model: ControlAffine, t: Scalar, ahead: Array | None) -> State:
-    if ahead is None:
-        return jnp.asarray(np.asarray(model.trim[0], float))
-    return trim_at(model, t + ahead)
+def _trim_at(model: ControlAffine, t: Scalar, travel: Array | None) -> State:
+    x = jnp.asarray(np.asarray(model.trim[0], float))
+    return x if travel is None else x + travel[0] + t * travel[1]
 
 
-def resting_leader(parts: Parts, answers: bool, ahead: Array | None) -> Law:
+def resting_leader(parts: Parts, answers: bool, ahead: float) -> Law:
     """Return the leaders' law with its path at rest; at the trim where it does not react."""
     assert isinstance(parts.drive, Laws)
-    leader = parts.drive.leader
+    leader, velocity = parts.drive.leader, trim_velocity(parts.model)
+    travel = np.stack([ahead * velocity, velocity]) if velocity.any() else None
     if not answers:
-        return RestingLeader(parts.drive.follower, ahead)
+        return RestingLeader(parts.drive.follower, travel)
     if reference_of(leader) is None:
         return leader
-    return dataclasses.replace(leader, reference=RestingPath(ahead))  # pyright: ignore
+    return dataclasses.replace(leader, reference=RestingPath(travel))  # pyright: ignore
 
 
 def reacts(parts: Parts) -> bool:
@@ -140,28 +140,22 @@ def reacts(parts: Parts) -> bool:
 
 
 def resting_loop(
-    prepared: Prepared,
-    graph_row: int | None,
-    steps: int,
-    ahead: float = 0.0,
-    own: bool = False,
+    prepared: Prepared, graph_row: int | None, steps: int, ahead: float = 0.0, own: bool = False
 ) -> Loop:
     """Return the loop of a run at rest, for so many steps.
 
-    Of a graph that switches it has one of its rows alone, unless that is None. Leaders whose trim
-    moves have done so for a time `ahead` (s). `own`: the leaders' law is theirs, if they react or
-    not.
+    Of a graph that switches it has one of its rows alone, unless that is None. A trim that moves
+    has done so for a time `ahead` (s). `own`: leaders keep their law, whether they react or not.
     """
     parts, problem = prepared.parts, prepared.problem
     assert isinstance(parts.drive, Laws)
-    begun = np.asarray(ahead) if moves(parts.model) else None
     still = problem._replace(
         settings=problem.settings._replace(horizon=steps * problem.settings.dt),
         motion=problem.motion.still,
         sensors=problem.sensors.still,
         channel=None if problem.channel is None else problem.channel.still,
     )
-    leader = resting_leader(parts, own or reacts(parts), begun)
+    leader = resting_leader(parts, own or reacts(parts), ahead)
     loop = assemble(still, leader, parts.drive.follower)
     loop = loop.replace(roster=Everybody())
     if graph_row is not None and isinstance(loop.graph, SwitchingLinks):
@@ -344,11 +338,19 @@ _NUMBERS = 2_000_000
 """Of all rows that are computed at a time."""
 
 
+class Span(NamedTuple):
+    """So many steps, and by how much all numbers (D,) move in one at rest; None for nothing."""
+
+    steps: Array
+    drift: Array | None
+
+
 def _moved(
-    loop: Loop, now: LoopState, free: Array, steps: Array, drift: Array | None
+    loop: Loop, now: LoopState, free: Array, span: Span
 ) -> tuple[Callable[[jax.Array], jax.Array], int]:
     """Return where numbers (d,) are after some steps, and how many there are at most in a row."""
-    rest = jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(now) if is_real(x)])
+    (steps, drift), leaves = span, jax.tree.leaves(now)
+    rest = jnp.concatenate([jnp.ravel(x) for x in leaves if is_real(x)])
 
     def moved(values: jax.Array) -> jax.Array:
         start = with_reals(now, rest.at[free].set(values))
@@ -362,13 +364,7 @@ def _moved(
 
 @compiled_for_one_call
 def slopes_along(
-    loop: Loop,
-    now: LoopState,
-    free: Array,
-    base: Array,
-    directions: Array,
-    steps: Array,
-    drift: Array | None,
+    loop: Loop, now: LoopState, free: Array, base: Array, directions: Array, span: Span
 ) -> tuple[jax.Array, jax.Array]:
     """Return where numbers are after some steps, and the derivative along directions, (K, d) each.
 
@@ -378,18 +374,15 @@ def slopes_along(
         free: (d,) the places of the numbers that may move.
         base: (d,) their values, the same for all directions: only slopes are computed K times.
         directions: (K, d).
-        steps: how many.
-        drift: (D,) by which all numbers move in a step at rest, which is left out; None for nothing.
+        span: how many steps.
     """
-    moved, rows = _moved(loop, now, free, steps, drift)
+    moved, rows = _moved(loop, now, free, span)
     start = (jnp.asarray(base),)
     return jax.lax.map(lambda d: jax.jvp(moved, start, (d,)), directions, batch_size=rows)
 
 
 @compiled_for_one_call
-def values_after(
-    loop: Loop, now: LoopState, free: Array, bases: Array, steps: Array, drift: Array | None
-) -> jax.Array:
+def values_after(loop: Loop, now: LoopState, free: Array, bases: Array, span: Span) -> jax.Array:
     """Return where numbers are after some steps from each of K values (K, d), likewise."""
-    moved, rows = _moved(loop, now, free, steps, drift)
+    moved, rows = _moved(loop, now, free, span)
     return jax.lax.map(moved, bases, batch_size=rows)

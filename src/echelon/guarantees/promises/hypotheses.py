@@ -12,8 +12,8 @@ import numpy as np
 
 from echelon.agents.models.linearization import at_trim
 from echelon.agents.models.model import ControlAffine, position_unit
-from echelon.agents.models.relative_equilibrium import trim_speed, trim_velocity
 from echelon.agents.models.model_check import Shortfall, at_limits, is_limited, trim_shortfall
+from echelon.agents.models.relative_equilibrium import trim_speed, trim_velocity
 from echelon.agents.network.events import Cut, Event, Join, agents_of
 from echelon.agents.network.graph import Graph
 from echelon.agents.world.actuator import Actuator
@@ -207,7 +207,9 @@ def _symmetric(case: GuaranteeInputs) -> Statement:
         lag, unit = turning_lag(case), position_unit(model)
         if lag is None:
             return fails(name, Kind.PROOF, text, remedy=remedy, reason=reason)
-        text += f"; turning with the leader, followers end up to {at_least(lag)} {unit} off their goals"
+        text += (
+            f"; turning with the leader, followers end up to {at_least(lag)} {unit} off their goals"
+        )
         number = lag, f"{at_least(lag)} {unit} off"
         return fails(name, Kind.PROOF, text, *number, remedy=remedy, reason=reason)
     if not np.ptp(formation.offsets, axis=0).any():

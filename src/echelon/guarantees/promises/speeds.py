@@ -11,6 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool
 
 from echelon.agents.models.heading_symmetry import state_turn
 from echelon.agents.models.model import ControlAffine, position_unit
@@ -39,19 +40,26 @@ _MOST, _UP, _DOWN = 50.0, 61, 41
 _HALVINGS, _DECAYS = 30, -1e-9
 _ROUNDING = 1e-6
 """Of the trim's speed: what derivatives of a path leave of a speed that is constant."""
-_TIMES, _SHORT = 2048, 1e-5
+_TIMES, _SHORT, _STOPS = 2048, 1e-5, 1e-3
 
 
 class SpeedRange(NamedTuple):
-    """The speeds between which modes decay, and what ends them, in words; in units of the state."""
+    """The speeds between which modes decay, what ends them in words, and that of the trim."""
 
     low: float
     high: float
     below: str
     above: str
+    made: float
+
+    def holds(self, speeds: Array) -> Bool[Array, " T"]:
+        """Tell which speeds (T,) are in it; whoever stops is in no range that begins at 0."""
+        near = _ROUNDING * self.made
+        low = _STOPS * self.made if self.low == 0.0 else self.low - near
+        return (speeds >= low) & (speeds <= self.high + near)
 
 
-class Modes(NamedTuple):
+class SteadyModes(NamedTuple):
     """The slowest mode (1/s) about a steady motion, and whether limits leave its input as it is."""
 
     slowest: float
@@ -88,7 +96,7 @@ def _slopes(model: ControlAffine, x: jax.Array, v: jax.Array) -> tuple[jax.Array
     return jax.jacfwd(motion, (0, 1))(x, v)
 
 
-def modes_at(case: GuaranteeInputs, speed: float) -> Modes | None:
+def modes_at(case: GuaranteeInputs, speed: float) -> SteadyModes | None:
     """Return the modes about steady motion at a speed along the trim's; None without one."""
     model, n = case.parts.model, len(case.parts.model.state_names)
     along = jnp.asarray(trim_velocity(model) / trim_speed(model))
@@ -103,7 +111,7 @@ def modes_at(case: GuaranteeInputs, speed: float) -> Modes | None:
     v = there[n:]
     u = model.physical(v)
     cut = np.abs(limited(model, u[None])[0] - u).max() > _ROUNDING * np.abs(u).max(initial=1.0)
-    return Modes(slowest_about(case, there[:n], v), not (case.settings.limits and cut))
+    return SteadyModes(slowest_about(case, there[:n], v), not (case.settings.limits and cut))
 
 
 @cached_jit
@@ -130,7 +138,7 @@ def speed_range(case: GuaranteeInputs) -> SpeedRange | None:
     low, below = _edge(fault, np.linspace(1.0, -1.0, _DOWN))
     # At 0 most vehicles cannot be steered, and rounding is left of it.
     low = low if abs(low) > _ROUNDING else 0.0
-    return SpeedRange(low * speed, high * speed, below, above)
+    return SpeedRange(low * speed, high * speed, below, above, speed)
 
 
 def _edge(fault: Callable[[float], str], factors: Array) -> tuple[float, str]:
@@ -154,8 +162,20 @@ class PathSpeeds(NamedTuple):
 
 def path_speeds(case: GuaranteeInputs) -> PathSpeeds | None:
     """Return the speeds of the leaders' path over a run; None of leaders that follow none."""
-    horizon, model = case.settings.horizon, case.parts.model
-    times = np.linspace(0.0, horizon, _TIMES)
+    whole = _speeds(case, 0.0, case.settings.horizon)
+    if whole is None:
+        return None
+    # A path may stop between two of these times.
+    k = int(whole.speeds.argmin())
+    near = _speeds(case, *whole.times[[max(0, k - 1), min(k + 1, _TIMES - 1)]])
+    assert near is not None
+    times = np.concatenate([whole.times, near.times])
+    order, speeds = times.argsort(), np.concatenate([whole.speeds, near.speeds])
+    return PathSpeeds(times[order], speeds[order])
+
+
+def _speeds(case: GuaranteeInputs, begin: float, end: float) -> PathSpeeds | None:
+    model, times = case.parts.model, np.linspace(begin, end, _TIMES)
     twice = jax.device_put(np.concatenate([times, times + _SHORT]))
     states = case.parts.drive.reference_states(model, twice)
     if states is None:
@@ -182,28 +202,30 @@ def speed_lines(case: GuaranteeInputs) -> Iterator[Statement]:
     if path is None:
         yield holds(_NAME, Kind.LINEARIZATION, f"{text}; the leader follows no path", *number)
         return
-    yield _compared(found, path, text, number, unit, _ROUNDING * trim_speed(model))
+    yield _compared(found, path, text, number, unit)
 
 
 def _compared(
-    found: SpeedRange,
-    path: PathSpeeds,
-    text: str,
-    number: tuple[float, str],
-    unit: str,
-    rounding: float,
+    found: SpeedRange, path: PathSpeeds, text: str, number: tuple[float, str], unit: str
 ) -> Statement:
-    low, high = found.low - rounding, found.high + rounding
-    outside = np.flatnonzero(~((path.speeds >= low) & (path.speeds <= high)))
-    slowest, fastest = path.speeds.min(), path.speeds.max()
+    slowest, fastest = float(path.speeds.min()), float(path.speeds.max())
+    outside = np.flatnonzero(~found.holds(path.speeds))
     if not len(outside):
         sizes = dict.fromkeys(about(x) for x in (slowest, fastest))
         text += f"; the path moves at {' to '.join(sizes)} {unit}"
         return holds(_NAME, Kind.LINEARIZATION, text, *number)
-    first = outside[0]
-    at = f"{about(path.speeds[first])} {unit} at {about(path.times[first])} s"
-    still = path.times[path.speeds <= 1e-3 * found.high]
-    stops = f", and stops at {about(still[0])} s" if len(still) else ""
-    text += f"; the path leaves that with {at}{stops}"
+    speed, time = float(path.speeds[outside[0]]), float(path.times[outside[0]])
+    text += f"; the path leaves that with {about(speed)} {unit} at {about(time)} s"
+    stop = _first_stop(path, _STOPS * found.made)
+    text += "" if stop is None else f", and stops at {about(stop)} s"
     remedy = "let the path keep to these speeds, or make the gain at another one"
     return fails(_NAME, Kind.LINEARIZATION, text, *number, remedy=remedy)
+
+
+def _first_stop(path: PathSpeeds, least: float) -> float | None:
+    """Return when a path is slowest in its first pause; None where it never pauses."""
+    still = np.flatnonzero(path.speeds <= least)
+    if not len(still):
+        return None
+    pause = still[still - np.arange(len(still)) == still[0]]
+    return float(path.times[pause[path.speeds[pause].argmin()]])
