@@ -68,7 +68,7 @@ def boat(model, x, u):
     nu, tau = x[3:], np.array([u[0], 0.0, u[1]])
     M = np.diag([model.surge_mass, model.sway_mass, model.yaw_inertia])
     p, q = -M[1, 1] * nu[1], M[0, 0] * nu[0]
-    C = np.array([[0.0, 0.0, p], [0.0, 0.0, q], [-p, -q, 0.0]])
+    C = np.array([[0.0, 0.0, p], [0.0, 0.0, q], [0.0, 0.0, 0.0]])  # without the Munk moment
     yaw = model.yaw_drag * (1.0 + model.yaw_growth * abs(nu[2]))
     D = np.diag([model.surge_drag, model.sway_drag, yaw])
     return [*turn @ nu[:2], nu[2], *np.linalg.solve(M, tau - (C + D) @ nu)]

@@ -21,12 +21,13 @@ class Boat(ControlAffine):
 
         m_u u' = m_v v r - d_u u + thrust
         m_v v' = -m_u u r - d_v v
-        J r' = (m_u - m_v) u v - d_r (1 + k |r|) r + moment
+        J r' = -d_r (1 + k |r|) r + moment
 
     Sideways nothing drives it, so at rest it cannot be stabilized; its trim moves at `speed`. The
     equations are of T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control, 2021,
-    with the masses, drags and thrusters of the Otter (2 m long, 6 knots) in his MSS toolbox; its
-    cross-flow drag and the coupling by its centre of gravity are left out.
+    with the masses, drags and thrusters of the Otter (2 m long, 6 knots) in his MSS toolbox. Left out
+    are cross-flow drag, the coupling by the centre of gravity, and the Munk moment, so that the
+    boat keeps its course by itself; the toolbox lets its users cancel that too.
 
     Args:
         speed: of the trim, m/s.
@@ -60,7 +61,7 @@ class Boat(ControlAffine):
     radius = 1.14
     state_groups = {"position": ("x", "y"), "velocity": ("u", "v")}
     heading = Heading("heading", (("x", "y"),))
-    weights = ((2.0, 1.3, 18.0, 0.01, 0.03, 0.02), (1.0, 0.12))
+    weights = ((4.3, 3.6, 24.0, 0.02, 0.02, 0.01), (1.0, 0.5))
 
     def __check_init__(self) -> None:
         """Check the parameters."""
@@ -93,8 +94,7 @@ class Boat(ControlAffine):
         c, s = jnp.cos(heading), jnp.sin(heading)
         surge = (self.sway_mass * v * r - self.surge_drag * u) / self.surge_mass
         sway = (-self.surge_mass * u * r - self.sway_drag * v) / self.sway_mass
-        munk = (self.surge_mass - self.sway_mass) * u * v
-        yaw = (munk - self.yaw_drag * (1.0 + self.yaw_growth * jnp.abs(r)) * r) / self.yaw_inertia
+        yaw = -self.yaw_drag * (1.0 + self.yaw_growth * jnp.abs(r)) * r / self.yaw_inertia
         return jnp.stack([u * c - v * s, u * s + v * c, r, surge, sway, yaw])
 
     def input_map(self, x: State) -> InputMap:

@@ -184,15 +184,14 @@ def _until_last(
     steps = int(schedule.switches(dt, 2.0 * float(schedule.starts[-1]))[0][-1])
     loop = resting_loop(prepared, None, steps + 1)
     now, value = begun(loop, goals, np.asarray(0)), _less(rest, rest.value, rest.since)
-    rest = early = rest._replace(loop=loop, now=now, value=value, since=0)
+    rest = rest._replace(loop=loop, now=now, value=value, since=0)
     if rest.whole is None:
-        start = reals(early.now)
-        start[rest.free] = rest.value
-        moved = with_reals(early.now, jnp.asarray(start))
-        after, slopes = reals(later(loop, moved, np.asarray(steps)))[rest.free], None
-        after = _less(rest, after, steps)
+        start = reals(now)
+        start[rest.free] = value
+        moved, slopes = with_reals(now, jnp.asarray(start)), None
+        after = _less(rest, reals(later(loop, moved, np.asarray(steps)))[rest.free], steps)
     else:
-        after, slopes = _maps(early, np.eye(len(rest.value)), steps)
+        after, slopes = _maps(rest, np.eye(len(value)), steps)
     if not (np.abs(after - value) <= _AT_REST * _scale(value)).all():
         return found._replace(faults=(Fault.NO_REST,), radius=None, map=None)
     if slopes is None:
