@@ -112,6 +112,10 @@ class Everybody(eqx.Module):
         """Return the moment with those who join in this step."""
         return now
 
+    def restarting(self, step: int) -> Array | None:
+        """Return which agents (N,) begin anew at a step, for the host; None where none ever do."""
+        return None
+
     def measured(self, meter: RunStatistics, step: jax.Array) -> RunStatistics:
         """Return the meter of errors relative to those whom agents follow at a step."""
         return meter
@@ -179,6 +183,11 @@ class ReturningAgents(JoiningAgents):
     def begin(self, states: States) -> PyTree:
         """Return the start."""
         return states
+
+    def restarting(self, step: int) -> Array | None:
+        """Return which agents (N,) begin anew at a step, for the host."""
+        now, before = (self.rows[self.switches.stretch(k)[0]] for k in (step, max(step - 1, 0)))
+        return now & ~before
 
     def _begun(self, new: jax.Array, now: LoopState, anew: Anew) -> LoopState:
         return anew(new, now.memory.roster)
