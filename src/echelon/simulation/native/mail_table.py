@@ -110,7 +110,7 @@ class MailTable:
 
     def leading(self, step: int) -> Array:
         """Return of each agent that may lead whether it does, (F N, k), as `BlockRows.lead`."""
-        return self.leads[:, :, step - self.first].reshape(self.count * self.loop.agents, -1)
+        return self.leads[:, step - self.first].reshape(self.count * self.loop.agents, -1)
 
     def _decide(self, step: int) -> None:
         # What is in flight at the first step is kept, so that a moment can be had at any later one.
@@ -252,7 +252,7 @@ def _step(radio: Radio, axes: PyTree, place: jax.Array, row: jax.Array) -> _Step
         letter = decided.slot.astype(jnp.int32) * row + place[senders]
         by = decided.place.astype(jnp.int32)
         packet = jnp.where(by >= 0, letter[by], -1)
-        leads = jnp.where(decided.leads, 2 - led, 0)[: len(place) * changes]
+        leads = jnp.where(decided.leads, 2 - led, 0).astype(jnp.int32)[: len(place) * changes]
         return now, (jnp.where(decided.new, letter, -1), packet, leads)
 
     def all_(now: Empty, step: jax.Array) -> tuple[Empty, _Decided]:
