@@ -25,8 +25,8 @@ class Boat(ControlAffine):
 
     Sideways nothing drives it, so at rest it cannot be stabilized; its trim moves at `speed`. The
     equations are of T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control, 2021,
-    with the masses, drags and thrusters of the Otter (2 m long, 6 knots) in his MSS toolbox. Left out
-    are cross-flow drag, the coupling by the centre of gravity, and the Munk moment, so that the
+    with the masses, drags and thrusters of the Otter (2 m long, 6 knots) in his MSS toolbox. Left
+    out are cross-flow drag, the coupling by the centre of gravity, and the Munk moment, so that the
     boat keeps its course by itself; the toolbox lets its users cancel that too.
 
     Args:

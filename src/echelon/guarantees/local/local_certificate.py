@@ -182,12 +182,11 @@ def _until_last(
     schedule, dt = prepared.parts.graph.schedule, prepared.problem.settings.dt
     assert schedule is not None
     steps = int(schedule.switches(dt, 2.0 * float(schedule.starts[-1]))[0][-1])
-    loop = resting_loop(prepared, None, steps + 1)
-    now, value = begun(loop, goals, np.asarray(0)), _less(rest, rest.value, rest.since)
+    loop, value = resting_loop(prepared, None, steps + 1), _less(rest, rest.value, rest.since)
+    now = begun(loop, goals, np.asarray(0))
     rest = rest._replace(loop=loop, now=now, value=value, since=0)
     if rest.whole is None:
-        start = reals(now)
-        start[rest.free] = value
+        (start := reals(now))[rest.free] = value
         moved, slopes = with_reals(now, jnp.asarray(start)), None
         after = _less(rest, reals(later(loop, moved, np.asarray(steps)))[rest.free], steps)
     else:
