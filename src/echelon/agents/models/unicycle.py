@@ -56,8 +56,8 @@ class Unicycle(ControlAffine):
         return (0.0, 0.0, 0.0), (self.speed, 0.0)
 
     def initial_integrators(self, x: State, ahead: jax.Array) -> jax.Array:
-        """Return the speed of what it follows."""
-        return jnp.hypot(*ahead[1])[None]
+        """Return the speed of what it follows, beyond that of the trim."""
+        return jnp.hypot(*ahead[1])[None] - self.speed
 
     def drift(self, x: State) -> State:
         """Return f = 0."""
