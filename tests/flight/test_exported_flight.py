@@ -58,7 +58,7 @@ def test_a_formation_is_kept_over_a_radio_and_by_who_comes_back(folder, tmp_path
 
 
 def test_a_flight_in_which_nothing_is_late_is_its_own_simulation(tmp_path, monkeypatch):
-    """By the logs, state and input of every tick; a period of 1/64 s has no rounding in its sums."""
+    """By the logs, state and input of every tick; sums of 1/64 s have no rounding."""
     dt = 1.0 / 64.0
     graph = ech.Graph([(0, 1), (1, 2)], directed=True)
     places = ech.Formation.from_offsets(CARTS, graph, {1: (1.0, 0.0), 2: (1.0, 0.8)})

@@ -10,7 +10,7 @@ import echelon as ech
 from echelon.core.statement import NO_LIMIT, Hypothesis
 from echelon.core.words import GuaranteeVerdict, Kind
 from echelon.experiments.results.recording import recording_of
-from echelon.guarantees.promises.coverage import covered
+from echelon.guarantees.promises.coverage import covered, watched_by
 from echelon.guarantees.promises.promise import promises
 
 SETTINGS, GRAPH = ech.Settings(horizon=4.0, dt=0.01), ech.Graph.path(3)
@@ -292,3 +292,55 @@ def test_a_linear_chain_keeps_its_limits_in_the_tube():
         number = found.hypotheses[Hypothesis.LIMITS].number
         assert not said[most] or (number is not None and largest <= most - number + 1e-9)
     assert said == {0.05: False, 50.0: True}
+
+
+def broken(parts, settings, result, agent):
+    """Return the texts of the conditions that an agent breaks in some step, by its own rows."""
+    values = {"x": result.states[:-1, agent], "u": result.inputs[:-1, agent]}
+    bound = lambda each, end, none: none if each[end] is None else each[end]  # noqa: E731
+    return {
+        each["text"]
+        for each in watched_by(parts, settings, agent)
+        for value in values[each["of"]] @ each["row"]
+        if not bound(each, "low", -np.inf) <= value <= bound(each, "high", np.inf)
+    }
+
+
+@pytest.mark.parametrize("size", [0.9, 40.0])
+def test_an_agent_sees_the_limits_that_act_on_it(size):
+    parts, gain = parts_of(Cart(dimension=2), ech.Graph.path(4))
+    settings = ech.Settings(horizon=6.0, dt=0.05)
+    radius = ech.guarantee(parts, settings).certified.radius
+    parts = parts.replace(initial=on_the_border(parts, gain, size * radius, seed=3))
+    result = ech.simulate(parts, settings)
+    acted = [bool(share) for share in result.saturated]
+    assert [bool(broken(parts, settings, result, k)) for k in range(4)] == acted
+    assert any(acted) == (size > 1.0)
+    free = settings._replace(limits=False)
+    assert watched_by(parts, free, 1) == []
+
+
+def test_an_agent_sees_that_it_leaves_the_domain_about_its_own_place():
+    model, graph = ech.models.Pendulum(), ech.Graph.path(3)
+    gain = ech.synthesize(model, graph, ech.gains.RobustLQR(domain={"angle": 0.4, "rate": 0.01}))
+    laws = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain, feedforward="relay"))
+    starts = np.array([[0.0, 0.0], [0.39, 0.0], [0.41, 0.0]])
+    parts = ech.Parts(model, graph, ech.Formation(np.zeros((3, 2))), laws, initial=starts)
+    result = ech.simulate(parts, SETTINGS)
+    seen = [broken(parts, SETTINGS, result, k) for k in range(3)]
+    out = np.abs(result.states[:-1, :, 0]).max(axis=0) > 0.4
+    assert [("`angle` is outside of the domain" in each) for each in seen] == out.tolist()
+    assert out[2] and not out[0]
+
+
+class Unlisted(ech.models.DoubleIntegrator):
+    """Inputs that its `limit` cuts, of which it states no rows."""
+
+    def limit(self, u):
+        return jnp.clip(u, -1.0, 1.0)
+
+
+def test_limits_that_a_model_does_not_state_cannot_be_watched():
+    parts, _ = parts_of(Unlisted(dimension=1), GRAPH)
+    assert watched_by(parts, SETTINGS, 1) is None
+    assert watched_by(parts, SETTINGS._replace(limits=False), 1) is not None

@@ -116,6 +116,15 @@ def test_nothing_is_watched_of_a_claim_that_ignores_what_acts():
     assert math.isnan(CoverageWatch({}).lost) and not ignores.look(0.0, [9.0], [9.0])
 
 
+@pytest.mark.parametrize(
+    ("verdict", "why"),
+    [("guaranteed", "an agent cannot see its conditions"), ("none", "nothing is guaranteed")],
+)
+def test_why_nothing_is_watched_is_the_verdict_s(verdict, why):
+    watch = CoverageWatch({"guarantee": {"verdict": verdict, "watched": None}})
+    assert math.isnan(watch.lost) and watch.why == why
+
+
 def report(scene, number=1, earlier=0):
     nothing, wire = Report(*[0] * 12, dropped=(0,) * len(Drop)), scene.wire(number)
     wire.begin(scene.context.wire.flight - earlier)

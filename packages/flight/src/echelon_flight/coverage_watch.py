@@ -1,8 +1,7 @@
 """Whether a flight keeps to the conditions of its guarantee that one agent can see.
 
-The rule is that of a run: its inputs at no limit, its states in the domain of the claim, and
-nothing acts that the claim ignores. Vehicles are not the model: a flight that keeps to them all has
-no proof, and one that does not has lost what the proof of the model was worth.
+They are those that cover a run: inputs at no limit, states in the domain of the claim, and nothing
+that the claim ignores. Of the vehicle nothing is proved, whether or not it keeps to them.
 """
 
 import math
@@ -19,21 +18,23 @@ class CoverageWatch:
 
     Attributes:
         lost: the time of the plan (s) at which the first condition was broken; infinite before,
-            NaN where nothing is guaranteed from the start.
-        why: which one that was, or why nothing is guaranteed; empty while all are kept.
+            NaN where there is nothing to watch.
+        why: which one that was, or why there is nothing to watch; empty while all are kept.
     """
 
     def __init__(self, facts: Mapping[str, Any]) -> None:
-        """Have seen nothing yet."""
+        """Begin with all conditions kept, if there are any to watch."""
         stated = facts.get("guarantee", {})
         watched, ignored = stated.get("watched"), stated.get("ignores")
         self.lost, self.why = math.inf, ""
         if watched is None or ignored:
-            self.lost, self.why = math.nan, " and ".join(ignored or ["nothing is guaranteed"])
+            nothing = stated.get("verdict", "none") == "none"
+            why = "nothing is guaranteed" if nothing else "an agent cannot see its conditions"
+            self.lost, self.why = math.nan, " and ".join(ignored or [why])
         self._conditions = [_condition(each) for each in watched or ()]
 
     def look(self, t: float, x: Sequence[float], u: Sequence[float]) -> bool:
-        """Judge a state and an input at a time of the plan (s); tell whether it is lost by them."""
+        """Return whether state and input at a time of the plan (s) are the first to break one."""
         if self.lost != math.inf:
             return False
         for of_input, row, low, high, text in self._conditions:
@@ -47,7 +48,7 @@ class CoverageWatch:
 def _condition(
     watched: Mapping[str, Any],
 ) -> tuple[bool, list[tuple[int, float]], float, float, str]:
-    """Return of what a row is, the row without its zeros, its bounds, and what is said beyond."""
+    """Return whether it is of the input, its row without zeros, its bounds, and its text."""
     low, high, row = watched["low"], watched["high"], enumerate(watched["row"])
     bounds = -math.inf if low is None else low, math.inf if high is None else high
     sparse = [(k, factor) for k, factor in row if factor]

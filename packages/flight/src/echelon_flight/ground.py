@@ -194,7 +194,7 @@ class Ground:
             "rate": _number(1.0 / report.step, 1) if report.step > 0.0 else None,
             "tick": _number(1e3 * report.tick, 2),
             "dropped": [f"{n} × {why.value}" for why, n in counts if n],
-            **_kept(report),
+            **_vehicle(report) | _guarantee(report),
         }
 
     def _nearest(self, number: int) -> tuple[float | None, int] | None:
@@ -217,13 +217,18 @@ def _fault(report: Report) -> Fault:
     return list(Fault)[report.fault] if report.fault < len(Fault) else Fault.NONE
 
 
-def _kept(report: Report) -> dict[str, Any]:
-    """Return link, battery, and whether the conditions of the guarantee are kept, in words."""
+def _vehicle(report: Report) -> dict[str, Any]:
+    """Return the link and what comes of it."""
+    battery = _number(report.battery, 2)
+    return {"link": report.link, "late": report.late, "battery": battery}
+
+
+def _guarantee(report: Report) -> dict[str, Any]:
+    """Return whether the conditions of the guarantee are kept, in words."""
     broken = math.isfinite(report.lost)
-    text = "none" + f": {report.why}" * bool(report.why) if math.isnan(report.lost) else "kept"
+    text = f"not watched: {report.why}" if math.isnan(report.lost) else "kept"
     text = f"lost at {report.lost:.2f} s: {report.why}" if broken else text
-    kept = {"guarantee": text, "broken": broken, "battery": _number(report.battery, 2)}
-    return {"link": report.link, "late": report.late, **kept}
+    return {"guarantee": text, "broken": broken}
 
 
 def _number(value: float, digits: int) -> float | None:

@@ -96,7 +96,7 @@ class Report(NamedTuple):
         battery: share that is left; NaN if it is not known.
         dropped: how many datagrams, in the order of `Drop`.
         lost: when the first condition of the guarantee was broken, s of the plan; infinite while
-            all are kept, NaN where nothing is guaranteed.
+            all are kept, NaN where there is nothing to watch.
         late: how many setpoints were late.
         why: which condition was broken.
         link: the address of the vehicle; of both texts 48 bytes are sent.

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.models.model_check import is_limited
 from echelon.core.digits import about
 from echelon.core.types import Array, JsonObject
 from echelon.core.words import Kind, Theorem
@@ -104,28 +105,28 @@ def first_exit(result: Result, promise: Guarantee) -> Exit | None:
 
 
 def watched_by(parts: Parts, settings: Settings, agent: int) -> list[JsonObject] | None:
-    """Return what one agent can watch of the conditions that `covered` asks of a run; None of none.
+    """Return what one agent can watch of the conditions that `covered` asks of a run.
 
     Each is a `row` of the vector `of` (`x` or `u`), whose value is between `low` and `high` (None:
-    unbounded) while the condition that `text` denies is met.
+    unbounded) while the condition that `text` denies is met. None without a theorem, and of a model
+    whose own `limit` states no rows.
     """
     box, model = kept_on_disk(_box_of, parts, settings), parts.model
-    if box is None:
+    if box is None or (settings.limits and is_limited(model) and model.input_limits is None):
         return None
     watched = list(_limits_of(model)) if settings.limits else []
-    # A bound that the formation's motion moves is the narrowest of its times.
-    times = np.linspace(0.0, settings.horizon, 200)
     trim, scale = model.trim, np.linalg.inv(np.asarray(model.input_scale, float))
+    # No domain is claimed of a formation whose offsets change.
     about = {
-        "x": (np.eye(len(trim[0])), parts.formation.offsets_at(times)[:, agent] + trim[0]),
-        "u": (scale, (scale @ np.asarray(trim[1], float))[None]),
+        "x": (np.eye(len(trim[0])), np.asarray(parts.formation.offsets[agent] + trim[0], float)),
+        "u": (scale, scale @ np.asarray(trim[1], float)),
     }
     names = {"x": model.state_names, "u": model.input_names}
     for of, sides in box.items() if agent in parts.graph.leaders or "u" not in box else ():
         rows, at = about[of]
         low, high = (np.asarray(side, float) for side in sides)
         texts = [f"`{name}` is outside of the domain" for name in names[of]]
-        watched += _rows(of, texts, rows, low + at.max(axis=0), high + at.min(axis=0))
+        watched += _rows(of, texts, rows, low + at, high + at)
     return watched
 
 
