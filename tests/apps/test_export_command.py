@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import echelon as ech
+from echelon.guarantees.promises.coverage import watched_by
 from echelon.output.archive.flight_folder import law_files
 
 ALONE = """
@@ -34,6 +35,7 @@ def test_the_files_state_whom_an_agent_hears_and_run_without_echelon(tmp_path, e
     whole = ech.guarantee(parts, settings).as_mapping()
     assert stated["guarantee"]["verdict"] == "guaranteed"
     assert stated["guarantee"].pop("while") == stated["guarantee"].pop("against") == []
+    assert stated["guarantee"].pop("watched") == watched_by(parts, settings, 1)
     assert {name: whole[name] for name in stated["guarantee"]} == stated["guarantee"]
     for name, digest in stated["sha256"].items():
         assert hashlib.sha256((out / name).read_bytes()).hexdigest() == digest

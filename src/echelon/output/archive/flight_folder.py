@@ -77,7 +77,7 @@ def law_files(parts: Parts, settings: Settings, agent: int, formation: str) -> d
         "law.c": c_text(functions, single.values(), about),
         "law.h": header_text(functions, about, constants | _sizes(double)),
     }
-    stated = guarantee_data(parts, settings) | {"watched": watched_by(parts, settings, agent)}
+    stated = guarantee_data(parts, settings) | _watched(parts, settings, agent)
     return {**files, "law.json": _facts(own, double, constants, stated, files)}
 
 
@@ -88,7 +88,12 @@ def python_law(
     own, functions = _traced(parts, settings, agent)
     about, constants = _head(settings, agent, formation)
     files = {"law.py": python_text(functions.values(), about, constants)}
+    stated = stated | _watched(parts, settings, agent)
     return {**files, "law.json": _facts(own, functions, constants, stated, files)}
+
+
+def _watched(parts: Parts, settings: Settings, agent: int) -> JsonObject:
+    return {"watched": watched_by(parts, settings, agent)}
 
 
 def _traced(parts: Parts, settings: Settings, agent: int) -> tuple[OwnLaw, dict[str, LawFunction]]:
@@ -206,8 +211,7 @@ def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, 
     agents, rule = parts.graph.agents, parts.leadership
     files, stated = dict[str, str](), guarantee_data(parts, settings)
     for k in range(agents):
-        own = stated | {"watched": watched_by(parts, settings, k)}
-        law = python_law(parts, settings, k, formation, own)
+        law = python_law(parts, settings, k, formation, stated)
         files |= {f"law-{k}/{name}": text for name, text in law.items()}
     facts = json.loads(files["law-0/law.json"])
     vehicles = _vehicles(parts, settings)
