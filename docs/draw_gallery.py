@@ -38,6 +38,7 @@ RUNS: dict[str, dict[str, Any]] = {
     "reshape": {"set": ("reference.amplitude=[1.0, 1.6]",), "video": ("reshape", 2.5)},
     "leader-lost": {"figures": {"trajectories": "backup"}, "video": ("backup", 1.5)},
     "paper-far": {"set": ("simulation.horizon=20",), "figures": {"trajectories": "far"}},
+    "boats": {"set": ("simulation.horizon=10",), "figures": {"trajectories": "boats"}},
     "flock.yaml": {
         "figures": {
             "network": "network",

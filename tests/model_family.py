@@ -3,8 +3,11 @@
 import numpy as np
 
 from echelon.agents.models import (
+    Bicycle,
+    Boat,
     CrazyflieAttitude,
     DoubleIntegrator,
+    FixedWing,
     Linear,
     Pendulum,
     PlanarQuadrotor,
@@ -32,6 +35,10 @@ MODELS = {
     "pendulum": Pendulum(damping=0.3, stiffness=4.0),
     "unicycle": Unicycle(),
     "point": UnicyclePoint(ahead=0.3),
+    "unicycle at speed": Unicycle(speed=1.5),
+    "bicycle": Bicycle(),
+    "boat": Boat(),
+    "fixed wing": FixedWing(),
     "planar": PlanarQuadrotor(mass=0.5, inertia=0.002, arm=0.1, motor_thrust=4.0),
     "planar crazyflie": PlanarQuadrotor(),
     "crazyflie": Quadrotor.crazyflie(),

@@ -37,7 +37,7 @@ LONG = [
     (*FIRST, "ground_robots", "troubleshooting"),
     ("recipes", "sweeps", "comparing"),
     *((name,) for name in ("networks", "events", "learning", "crazyflie", "autopilots")),
-    *((name,) for name in ("matlab", "onboard")),
+    *((name,) for name in ("matlab", "onboard", "at_speed")),
 ]
 JOURNEYS = [
     pytest.param(("README",), id="README"),

@@ -56,7 +56,41 @@ def printed(model, x, u):
     return turning + np.concatenate([np.zeros(3), np.full(3, u[0] / model.mass), np.zeros(6)])
 
 
+def bicycle(model, x, u):
+    _, _, heading, v, steering = x
+    turn = v / model.wheelbase * np.sin(steering) / np.cos(steering)
+    return [v * np.cos(heading), v * np.sin(heading), turn, u[0], u[1]]
+
+
+def boat(model, x, u):
+    # Fossen's M v' + C(v) v + D(v) v = tau, with C of the masses on the diagonal.
+    turn = np.array([[np.cos(x[2]), -np.sin(x[2])], [np.sin(x[2]), np.cos(x[2])]])
+    nu, tau = x[3:], np.array([u[0], 0.0, u[1]])
+    M = np.diag([model.surge_mass, model.sway_mass, model.yaw_inertia])
+    p, q = -M[1, 1] * nu[1], M[0, 0] * nu[0]
+    C = np.array([[0.0, 0.0, p], [0.0, 0.0, q], [0.0, 0.0, 0.0]])  # without the Munk moment
+    yaw = model.yaw_drag * (1.0 + model.yaw_growth * abs(nu[2]))
+    D = np.diag([model.surge_drag, model.sway_drag, yaw])
+    return [*turn @ nu[:2], nu[2], *np.linalg.solve(M, tau - (C + D) @ nu)]
+
+
+def fixed_wing(model, x, u):
+    # Newton's law for the point mass: weight, drag and thrust along, lift across the velocity.
+    _, _, _, heading, climb, V, bank = x
+    along = [np.cos(climb) * np.cos(heading), np.cos(climb) * np.sin(heading), np.sin(climb)]
+    side = np.array([-np.sin(heading), np.cos(heading), 0.0])
+    up = np.cross(along, side)
+    drag = model.gravity / model.glide * V**2 / model.airspeed**2
+    lift = u[1] * model.gravity * (np.cos(bank) * up + np.sin(bank) * side)
+    push = (u[0] - drag) * np.array(along) + lift - [0.0, 0.0, model.gravity]
+    rates = [push @ side / (V * np.cos(climb)), push @ up / V, push @ along]
+    return [*V * np.array(along), *rates, u[2]]
+
+
 EQUATIONS = {
+    models.Bicycle: bicycle,
+    models.Boat: boat,
+    models.FixedWing: fixed_wing,
     models.SingleIntegrator: lambda m, x, u: u,
     models.DoubleIntegrator: lambda m, x, u: [
         *x[m.dimension :],
@@ -139,7 +173,9 @@ def test_quadrotor_is_newton_euler_for_any_parameters(x, u, mass, sides, gravity
 @every_model
 def test_the_trim_is_an_equilibrium_within_the_limits(model):
     x, u = map(np.array, model.trim)
-    assert np.abs(numpy(model.velocity, x, u)).max() <= 1e-12
+    speed = getattr(model, "airspeed", getattr(model, "speed", 0.0))
+    # A vehicle at a speed moves straight on; all others rest.
+    assert numpy(model.velocity, x, u) == pytest.approx(speed * np.eye(len(x))[0], abs=1e-12)
     assert numpy(model.limit, u).tobytes() == u.tobytes()
     assert min(*model.weights[0], *model.weights[1]) > 0.0
     assert [model.state_names[k] for k in model.position_indices()] == [*model.position]

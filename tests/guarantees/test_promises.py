@@ -396,7 +396,7 @@ def test_the_data_of_a_run_hold_the_whole_promise():
     assert told.pop("covered") is None
     assert told == ech.guarantee(parts, settings(horizon=0.1)).as_mapping()
     # These lines are there only for laws that turn, graphs that switch, motors, networks, ...
-    apart = {Hypothesis.HEADING_FRAME, Hypothesis.SWITCHING, Hypothesis.LIMITS}
+    apart = {Hypothesis.HEADING_FRAME, Hypothesis.SWITCHING, Hypothesis.LIMITS, Hypothesis.SPEEDS}
     apart |= {Hypothesis.AGES, Hypothesis.HELD, Hypothesis.LEADER}
     apart |= {Hypothesis.MESSAGES, Hypothesis.OWN_STATE, Hypothesis.SEPARATION, Hypothesis.EVENTS}
     always = {h.value for h in Hypothesis if h not in apart}

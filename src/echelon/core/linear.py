@@ -24,6 +24,29 @@ _SCALINGS = 20  # each halves the decades by which rows and columns differ
 _AXIS = 64 * float(np.finfo(float).eps)  # of the fastest mode's rate, that of rounding
 
 
+_ROUNDS, _RESIDUAL = 20, 1e-10
+"""Newton's, and what may be left."""
+
+
+def newton_least(
+    left: Callable[[Array], tuple[Array, Array]], start: Array, free: Array | None = None
+) -> Array | None:
+    """Return where `left`, which returns a remainder and its slope, is zero, by least changes.
+
+    None where Newton's method finds none. Changes of entries count the less the larger their `free`
+    (k,) is.
+    """
+    z, free = np.asarray(start, float), np.ones(len(start)) if free is None else free
+    for _ in range(_ROUNDS):
+        rest, slope = left(z)
+        if np.abs(rest).max() <= _RESIDUAL:
+            return z
+        if not (np.isfinite(rest).all() and np.isfinite(slope).all()):
+            return None
+        z = z - free * np.linalg.lstsq(slope * free, rest, rcond=None)[0]
+    return None
+
+
 def discretize(
     A: np.ndarray, B: np.ndarray, dt: float, integrator: str | None = None, substeps: int = 1
 ) -> tuple[np.ndarray, np.ndarray]:

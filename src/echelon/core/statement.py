@@ -29,6 +29,7 @@ class Hypothesis(Word):
     DISAGREEMENT_DECAY = "disagreement decays"
     ALONG_PATH = "law along the leader's path"
     HEADING_FRAME = "law turns with the heading"
+    SPEEDS = "speeds of the path"
     SAMPLING = "step, input held"
     SWITCHING = "graphs that take turns"
     EVENTS = "events of the run"

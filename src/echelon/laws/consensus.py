@@ -10,18 +10,33 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from echelon.agents.models.heading_symmetry import state_turn
+from echelon.agents.models.heading_symmetry import heading_index, rest_heading, state_turn
 from echelon.agents.models.linear_agent import SingleIntegrator
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.models.relative_equilibrium import moves
 from echelon.agents.network.graph import Graph
+from echelon.agents.references.flatness import followed_states
 from echelon.core.errors import LawError, check_name
+from echelon.core.numerics import precision
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.core.words import DEFAULT_FEEDFORWARD, Feedforward, Frame, Word
-from echelon.laws.law import Checks, Faces, Feeds, Law, LocalView, Memory, Proves, check_gain_fits
+from echelon.laws.law import (
+    Checks,
+    Faces,
+    Feeds,
+    Law,
+    LocalView,
+    Memory,
+    Proves,
+    check_gain_fits,
+    reference_of,
+)
 from echelon.synthesis.gains.gain import Gain
 from echelon.synthesis.gains.strings import string_growth
 
 _Word = TypeVar("_Word", bound=Word)
+_WATCHED, _MOMENTS, _STRAIGHT = 600.0, 2048, 1e-6
+"""s and times at which a path is looked at; sine of half an angle that is still straight."""
 
 
 def _member(key: str, kind: type[_Word]) -> Callable[[object], _Word]:
@@ -98,6 +113,8 @@ class Consensus(Law, Faces, Feeds, Proves, Checks):
         """Let the gain turn if it changes with the heading, and the leader may change its own."""
         turning = self.frame is Frame.HEADING and self.gain.turns(model)
         turning = turning and not Faces.of(leader).keeps_heading(model)
+        if self.frame is Frame.WORLD and moves(model) and self.gain.turns(model):
+            _check_straight(leader, model)
         return self if turning is self.turning else dataclasses.replace(self, turning=turning)
 
     def warnings(self, model: ControlAffine, graph: Graph) -> tuple[str, ...]:
@@ -130,6 +147,25 @@ class Consensus(Law, Faces, Feeds, Proves, Checks):
         """Return the drift with the inner loop closed."""
         # Assumption 5 is about this drift: the loop acts without any neighbour.
         return model.velocity(x, model.physical(self.gain.inner_loop(model, x, self.angle)))
+
+
+def _check_straight(leader: Law, model: ControlAffine) -> None:
+    """Raise `LawError` if a leader's path leaves the heading of a trim that moves."""
+    reference = reference_of(leader)
+    if reference is None:
+        return
+    times = np.linspace(0.0, _WATCHED, _MOMENTS)
+    with precision("float64"):
+        states = np.asarray(followed_states(model, reference, times))
+    away = np.abs(np.sin(0.5 * (states[:, heading_index(model)] - rest_heading(model))))
+    turned = np.flatnonzero(away > _STRAIGHT)
+    if len(turned):
+        raise LawError(
+            f"`frame` of `Consensus` is `{Frame.WORLD}`, the trim of `{type(model).__name__}` "
+            f"moves, and the leader's heading is {2.0 * np.arcsin(away[turned[0]]):.3g} rad off "
+            f"the trim's at {times[turned[0]]:.3g} s; a gain for one heading leads agents apart "
+            f"in others, so use `{Frame.HEADING}`."
+        )
 
 
 def _match_velocity(law: Consensus, model: ControlAffine, x: State, velocity: State) -> Input:

@@ -1,5 +1,8 @@
 """Agents: the interface `ControlAffine` and the bundled members."""
 
+from echelon.agents.models.bicycle import Bicycle
+from echelon.agents.models.boat import Boat
+from echelon.agents.models.fixed_wing import FixedWing
 from echelon.agents.models.linear_agent import DoubleIntegrator, Linear, SingleIntegrator
 from echelon.agents.models.model import ControlAffine, Heading, Limits
 from echelon.agents.models.oscillators import Pendulum, VanDerPol
@@ -9,9 +12,12 @@ from echelon.agents.models.quadrotor_euler import CrazyflieAttitude, QuadrotorEu
 from echelon.agents.models.unicycle import Unicycle, UnicyclePoint
 
 __all__ = [
+    "Bicycle",
+    "Boat",
     "ControlAffine",
     "CrazyflieAttitude",
     "DoubleIntegrator",
+    "FixedWing",
     "Heading",
     "Limits",
     "Linear",

@@ -8,6 +8,7 @@ from echelon.agents.models.model import (
     FlatBound,
     FlatChains,
     Heading,
+    Pair,
     check_positive,
     diagonal,
     wrap_angles,
@@ -28,8 +29,13 @@ class Unicycle(ControlAffine):
     """xdot = v cos(heading), ydot = v sin(heading), headingdot = turn rate; metres and radians.
 
     Its linearization at rest cannot be stabilized (sideways motion), so Riccati gains do not exist
-    for it.
+    for it; at a `speed` they do.
+
+    Args:
+        speed: of the trim, m/s.
     """
+
+    speed: float = 0.0
 
     state_names = ("x", "y", "heading")
     state_units = ("m", "m", "rad")
@@ -44,9 +50,14 @@ class Unicycle(ControlAffine):
     # Where (x', y') is not 0 it has the heading's direction and the speed for its length.
     flat_bounds = (FlatBound(("x", "y"), 1, 0.0, "a speed above 0"),)
 
+    @property
+    def trim(self) -> Pair:
+        """Straight ahead at `speed`."""
+        return (0.0, 0.0, 0.0), (self.speed, 0.0)
+
     def initial_integrators(self, x: State, ahead: jax.Array) -> jax.Array:
-        """Return the speed of what it follows."""
-        return jnp.hypot(*ahead[1])[None]
+        """Return the speed of what it follows, beyond that of the trim."""
+        return jnp.hypot(*ahead[1])[None] - self.speed
 
     def drift(self, x: State) -> State:
         """Return f = 0."""

@@ -10,6 +10,7 @@ from jax.core import Tracer
 from jaxtyping import Bool, Float
 
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.models.relative_equilibrium import trim_velocity
 from echelon.agents.references.reference import LeaderPath, Reference, check_reference
 from echelon.core.cache import memoize
 from echelon.core.compiled import cached_jit
@@ -71,9 +72,9 @@ class Targets(NamedTuple):
 
 def reference_targets(model: ControlAffine, reference: LeaderPath | None, times: Array) -> Targets:
     """Return a leader's targets: its reference by `flat`, or its trim; else raise `PlanError`."""
-    # Without a reference a leader stays at rest, at its trim.
+    # Without a reference a leader stays at its trim, or moves with it.
     if reference is None:
-        x = np.tile(np.asarray(model.trim[0], float), (len(times), 1))
+        x = np.asarray(model.trim[0], float) + np.multiply.outer(times, trim_velocity(model))
         return _targets(model, x, np.zeros((len(times), len(model.input_names))))
     check_reference(reference)
     try:

@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from echelon.agents.models.linearization import at_trim
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.models.relative_equilibrium import trim_velocity
 from echelon.agents.references.reference import LeaderPath
 from echelon.agents.world.world import World
 from echelon.core.digits import about
@@ -107,7 +108,8 @@ class _Momentary(LeaderPath):
 def state_space(parts: Parts, file: PathLike | None = None) -> StateSpace:
     """Return the closed loop linearized at rest: all agents at their goals, the leader at its trim.
 
-    All quantities are deviations from that rest, in continuous time, in the model's units:
+    A trim that moves rests in axes that move with it. All quantities are deviations from that rest,
+    in continuous time, in the model's units:
 
     - x (N n): the states of agent 0, then of agent 1, and so on.
     - w (n + m): the state and the input that the leaders' reference prescribes. Without a
@@ -179,7 +181,7 @@ def _linearized(loop: Loop, parts: Parts) -> StateSpace:
             now = eqx.tree_at(lambda loop: loop.laws.leader.reference, loop, moment)
         begun = jax.tree.map(jnp.asarray, begin_forgetful(now, states))
         inputs = control(now, begun, Steps(begun.step, now.motion.dt)).inputs
-        return jax.vmap(model.velocity)(states, inputs)
+        return jax.vmap(model.velocity)(states, inputs) - trim_velocity(model)[None]
 
     def errors(states: States, w: jax.Array) -> States:
         places = states - loop.places.offsets

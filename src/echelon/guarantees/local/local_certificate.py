@@ -17,11 +17,14 @@ import scipy.sparse.csgraph as csgraph
 import scipy.sparse.linalg as spla
 
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.models.relative_equilibrium import moves, trim_velocity
 from echelon.agents.network.graph import Graph
+from echelon.core.digits import about
 from echelon.core.types import Array, PyTree
-from echelon.core.words import Feedforward
+from echelon.core.words import Feedforward, amount
 from echelon.guarantees.local.resting_loop import (
     BodyPlaces,
+    Span,
     begun,
     body_of,
     held_exactly,
@@ -71,6 +74,7 @@ class Fault(enum.StrEnum):
     OFF_GOALS = "agents rest off their goals"
     TIME = "the step depends on time"
     WHOLE = "the step depends on whole numbers that it remembers"
+    PLACES = "the step depends on where agents are"
     KINK = "the step is not differentiable where agents rest"
     LASTING = "the law reads a memory that nothing changes"
     ADRIFT = "nothing drives a state to its goal"
@@ -140,13 +144,25 @@ def local_certificate(prepared: Prepared) -> LocalCertificate:
         timed = _timed(law, loop, parts.model, goals)
         if timed is not None:
             return LocalCertificate((timed[0],), culprit=timed[1])
+    moving = _moving(prepared, row, settled, period, goals)
+    if isinstance(moving, str):
+        return LocalCertificate((Fault.PLACES,), culprit=moving)
     now = begun(loop, goals, np.asarray(settled))
-    rest = _rest_of(loop, now, _movers(parts, answer), period, parts.graph)
-    foreign = bool(parts.drive.unknown or own_members(loop))
+    rest = _rest_of(loop, now, _movers(parts, answer), period, parts.graph, moving)
+    return _certified(prepared, rest, goals, period, row)
+
+
+def _certified(
+    prepared: Prepared, rest: "_Rest", goals: Array, period: int, row: int | None
+) -> LocalCertificate:
+    parts, channel = prepared.parts, prepared.problem.channel
+    if not _leaders_rest(rest, period):
+        return LocalCertificate((Fault.NO_REST,))
+    foreign = bool(parts.drive.unknown or own_members(rest.loop))
     found = _judged(rest, goals, period, parts.model.state_names, foreign)
     if row and found.radius is not None:
         found = _until_last(prepared, rest, goals, found)
-    steady = problem.channel is None or problem.channel.steady
+    steady = channel is None or channel.steady
     return found._replace(period=period, steady=steady)
 
 
@@ -166,16 +182,16 @@ def _until_last(
     schedule, dt = prepared.parts.graph.schedule, prepared.problem.settings.dt
     assert schedule is not None
     steps = int(schedule.switches(dt, 2.0 * float(schedule.starts[-1]))[0][-1])
-    loop = resting_loop(prepared, None, steps + 1)
-    early = rest._replace(loop=loop, now=begun(loop, goals, np.asarray(0)))
+    loop, value = resting_loop(prepared, None, steps + 1), _less(rest, rest.value, rest.since)
+    now = begun(loop, goals, np.asarray(0))
+    rest = rest._replace(loop=loop, now=now, value=value, since=0)
     if rest.whole is None:
-        start = reals(early.now)
-        start[rest.free] = rest.value
-        moved = with_reals(early.now, jnp.asarray(start))
-        after, slopes = reals(later(loop, moved, np.asarray(steps)))[rest.free], None
+        (start := reals(now))[rest.free] = value
+        moved, slopes = with_reals(now, jnp.asarray(start)), None
+        after = _less(rest, reals(later(loop, moved, np.asarray(steps)))[rest.free], steps)
     else:
-        after, slopes = _maps(early, np.eye(len(rest.value)), steps)
-    if not (np.abs(after - rest.value) <= _AT_REST * _scale(rest.value)).all():
+        after, slopes = _maps(rest, np.eye(len(value)), steps)
+    if not (np.abs(after - value) <= _AT_REST * _scale(value)).all():
         return found._replace(faults=(Fault.NO_REST,), radius=None, map=None)
     if slopes is None:
         return found
@@ -269,6 +285,75 @@ def _whole(tree: PyTree, used: list[bool]) -> bool:
     return any(use and not is_real(leaf) for leaf, use in pairs)
 
 
+# ---- trims that move -----------------------------------------------------------------------------
+# T shifts states and all that is remembered of them. If step(T s) = T step(s), the derivative of a
+# step is the same all along the motion, and a moment rests if a step shifts it by w dt.
+
+_AWAY = 0.01
+_PLACES = (1.0, -37.0, 900.0)
+"""s of motion by which a formation is shifted, and how far off its goals it is meanwhile."""
+
+
+class _Moving(NamedTuple):
+    """As in `_Rest`."""
+
+    drift: Array | None
+    since: int
+
+
+def _moving(
+    prepared: Prepared, row: int | None, settled: int, period: int, goals: Array
+) -> _Moving | str:
+    """Return how all moves at rest, or why that depends on where agents are, in words."""
+    if not moves(prepared.parts.model):
+        return _Moving(None, settled)
+    bound = _bound_to_places(prepared, row, settled + 3 * period, goals)
+    return bound or _Moving(_drift(prepared, row, settled, period, goals), settled)
+
+
+def _bound_to_places(prepared: Prepared, row: int | None, steps: int, goals: Array) -> str:
+    """Return what differs if all begin elsewhere, in words; empty where nothing does."""
+    model, rest = prepared.parts.model, []
+    draw = np.random.default_rng(0).standard_normal(goals.shape)
+    for ahead in (0.0, *_PLACES):
+        loop = resting_loop(prepared, row, steps, ahead, own=True)
+        shift = ahead * trim_velocity(model)
+        now = begun(loop, goals + _AWAY * draw + shift, np.asarray(steps))
+        rest.append(np.asarray(now.states) - shift)
+    gaps = np.abs(np.array(rest[1:]) - rest[0]).max(axis=(0, 1))
+    # Places far away are rounded, in each step, and a loop that grows multiplies that.
+    off = np.abs(rest[0] - goals - steps * prepared.problem.settings.dt * trim_velocity(model))
+    if (gaps <= _AT_REST * steps * max(1.0, float(off.max()) / _AWAY)).all():
+        return ""
+    k = int(np.argmax(np.where(np.isfinite(gaps), gaps, np.inf)))
+    return f"`{model.state_names[k]}` differs by {about(gaps[k])} after {amount(steps, 'step')}"
+
+
+def _drift(prepared: Prepared, row: int | None, settled: int, period: int, goals: Array) -> Array:
+    """Return by how much all numbers of a moment move in a step, (D,), where all are at rest."""
+    ahead, moments = period * prepared.problem.settings.dt, []
+    for time in (0.0, ahead):
+        loop = resting_loop(prepared, row, settled + 3 * period, time)
+        shift = time * trim_velocity(prepared.parts.model)
+        moments.append(reals(begun(loop, goals + shift, np.asarray(settled))))
+    return (moments[1] - moments[0]) / period
+
+
+def _leaders_rest(rest: "_Rest", period: int) -> bool:
+    """Tell whether agents that are not looked at move with the trim; so do those of one at rest."""
+    if rest.drift is None:
+        return True
+    others = (rest.body.agent >= 0) & ~np.isin(rest.body.agent, rest.movers)
+    now, then = reals(rest.now), reals(later(rest.loop, rest.now, np.asarray(period)))
+    gaps = np.abs(then - now - period * rest.drift) / _scale(now)
+    return bool((gaps[others] <= _AT_REST).all())
+
+
+def _less(rest: "_Rest", values: Array, steps: int) -> Array:
+    """Return numbers (d,) less what they move at rest in some steps."""
+    return values if rest.drift is None else values - steps * rest.drift[rest.free]
+
+
 # ---- where everybody rests -----------------------------------------------------------------------
 
 
@@ -286,6 +371,8 @@ class _Rest(NamedTuple):
         whole: (d, d) the map of everything; None of one that is split, or too large.
         common: the radius of what all do alike, where nobody is led.
         probes: random directions (K, d) and the derivative along them, of one that is split.
+        drift: (D,) by which all numbers of the moment move in a step at rest; None for nothing.
+        since: steps since the agents began at their goals.
     """
 
     loop: Loop
@@ -302,6 +389,8 @@ class _Rest(NamedTuple):
     whole: Array | None
     common: float = 0.0
     probes: tuple[Array, Array] | None = None
+    drift: Array | None = None
+    since: int = 0
 
     @property
     def map(self) -> Split | None:
@@ -317,7 +406,9 @@ class _Rest(NamedTuple):
         return states[: self.size] if self.split is not None else states
 
 
-def _rest_of(loop: Loop, now: LoopState, movers: Array, period: int, graph: Graph) -> _Rest:
+def _rest_of(
+    loop: Loop, now: LoopState, movers: Array, period: int, graph: Graph, moving: _Moving
+) -> _Rest:
     """Return where everybody rests, looked for from a moment on, and the map about it."""
     body = body_of(loop, now)
     mine = [np.flatnonzero(body.agent == k) for k in movers]
@@ -328,6 +419,7 @@ def _rest_of(loop: Loop, now: LoopState, movers: Array, period: int, graph: Grap
     links = _links_of(loop, movers) if size and not len(shared) and period == 1 else None
     value, known = reals(now)[free], (None, None)
     rest = _Rest(loop, graph, now, body, free, value, np.inf, movers, links, size, *known)
+    rest = rest._replace(**moving._asdict())
     if len(free) > _DENSE:
         return rest if links is None else _split_at(_settled(rest), period)
     rest = _by_newton(rest, period)
@@ -336,7 +428,7 @@ def _rest_of(loop: Loop, now: LoopState, movers: Array, period: int, graph: Grap
 
 def _maps(rest: _Rest, directions: Array, period: int) -> tuple[Array, Array]:
     """Return the numbers (d,) a period later, and the derivative along directions (K, d)."""
-    rows = rest.free, rest.value, directions, np.asarray(period)
+    rows = rest.free, rest.value, directions, Span(np.asarray(period), rest.drift)
     values, slopes = map(np.asarray, slopes_along(rest.loop, rest.now, *rows))
     return values[0], slopes
 
@@ -346,7 +438,8 @@ def _values(rest: _Rest, bases: Array, period: int) -> Array:
     # One shape, and so one program.
     count = max(_PROBES, len(bases))
     rows = np.concatenate([bases, np.tile(rest.value, (count - len(bases), 1))])
-    after = values_after(rest.loop, rest.now, rest.free, rows, np.asarray(period))
+    span = Span(np.asarray(period), rest.drift)
+    after = values_after(rest.loop, rest.now, rest.free, rows, span)
     return np.asarray(after)[: len(bases)]
 
 
@@ -373,7 +466,7 @@ def _settled(rest: _Rest) -> _Rest:
     """Return a moment that a step leaves as it is, or that of agents left alone for long."""
     for steps in (0, _WARM):
         now = later(rest.loop, rest.now, np.asarray(steps)) if steps else rest.now
-        rest = rest._replace(now=now, value=reals(now)[rest.free])
+        rest = rest._replace(now=now, value=reals(now)[rest.free], since=rest.since + steps)
         moved = np.abs(_values(rest, rest.value[None], 1)[0] - rest.value)
         rest = rest._replace(residual=float((moved / _scale(rest.value)).max()))
         if rest.residual <= _AT_REST:
@@ -488,8 +581,9 @@ def _arrives(rest: _Rest, period: int) -> bool:
     before = np.abs(start - rest.value) / _scale(rest.value)
     if not (before > _AT_REST).any():
         return True
-    then = reals(later(rest.loop, rest.now, np.asarray(period * -(-_WARM // period))))[rest.free]
-    after = np.abs(then - rest.value) / _scale(rest.value)
+    steps = period * -(-_WARM // period)
+    then = reals(later(rest.loop, rest.now, np.asarray(steps)))[rest.free]
+    after = np.abs(_less(rest, then, steps) - rest.value) / _scale(rest.value)
     return bool(((after <= _AT_REST) | (after < _NEARER * before)).all())
 
 
@@ -520,7 +614,7 @@ def _judged(
     states, agents = rest.body.state[rest.free], rest.body.agent[rest.free]
     at = states >= 0
     there = goals[agents[at], states[at]]
-    gaps = np.abs(rest.value[at] - there) / _scale(there)
+    gaps = np.abs(_less(rest, rest.value, rest.since)[at] - there) / _scale(there)
     if not (gaps <= _AT_REST).all():
         off, culprit = float(gaps.max()), names[states[at][gaps.argmax()]]
         return LocalCertificate((Fault.OFF_GOALS,), off=off, culprit=culprit)

@@ -59,6 +59,10 @@ def _repeats(parts: Parts, local: LocalCertificate) -> Statement:
 
 def _rests(parts: Parts, local: LocalCertificate) -> Statement:
     name = Hypothesis.REST
+    if Fault.PLACES in local.faults:
+        text = f"the step depends on where agents are: shifted as the trim moves, {local.culprit}"
+        remedy = "let laws use differences of positions alone"
+        return fails(name, _LINEAR, text, remedy=remedy, reason=text)
     if Fault.NO_REST in local.faults:
         text = "agents at their goals do not stay there, and no place was found where they rest"
         remedy = "let the law return the trim input where nothing disagrees"
@@ -127,7 +131,8 @@ def _decays(parts: Parts, settings: Settings, local: LocalCertificate, shorter: 
     return holds(name, _LINEAR, text, *number)
 
 
-_TOLD = {Fault.TIME, Fault.WHOLE, Fault.SWITCHES, Fault.NO_REST, Fault.OFF_GOALS, Fault.KINK}
+_TOLD = {Fault.TIME, Fault.WHOLE, Fault.SWITCHES, Fault.PLACES}
+_TOLD |= {Fault.NO_REST, Fault.OFF_GOALS, Fault.KINK}
 """What other lines tell."""
 
 

@@ -2,6 +2,8 @@
 
 The leaders rest at their trim, unless they react; nothing pushes, measures or loses at random. All
 else is what runs: laws, their memories, limits, motors, estimators, the ages of messages, plants.
+
+Where the trim moves, rest is motion with it: whoever and whatever moves by w dt in a step stays.
 """
 
 import dataclasses
@@ -17,6 +19,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.models.relative_equilibrium import trim_velocity
 from echelon.agents.references.reference import LeaderPath
 from echelon.core.compiled import cached_jit, compiled_for_one_call
 from echelon.core.numerics import Field
@@ -38,9 +41,13 @@ from echelon.simulation.step.sequence import begin, step
 
 @final
 class RestingLeader(Law, Travels, Speaks):
-    """A leader that rests at its trim, as everybody expects, and says what a follower would."""
+    """A leader that rests at its trim, as everybody expects, and says what a follower would.
+
+    `travel` (2, n): how far it is off its trim at first, and how fast that moves; None if it rests.
+    """
 
     follower: Law
+    travel: Array | None = None
     plans = True
 
     def init(self) -> Memory:
@@ -76,7 +83,7 @@ class RestingLeader(Law, Travels, Speaks):
         period: Scalar | float,
     ) -> Expected:
         """Return what it says at its trim, with the deviation."""
-        x = jnp.asarray(np.asarray(model.trim[0], float))
+        x = _trim_at(model, t, self.travel)
         return Expected(deviation + self._said(model, x, jnp.zeros_like(x), self.begin(model, x)))
 
     def _said(self, model: ControlAffine, x: State, offset: State, memory: Memory) -> jax.Array:
@@ -86,12 +93,14 @@ class RestingLeader(Law, Travels, Speaks):
 
 @final
 class RestingPath(LeaderPath):
-    """A path that stays at the trim of the model."""
+    """A path that stays at the trim of the model, or moves with it."""
+
+    travel: Array | None = None
 
     def follow(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:
         """Return the trim."""
-        x, u = (jnp.asarray(np.asarray(part, float)) for part in model.trim)
-        return x, u
+        u = jnp.asarray(np.asarray(model.trim[1], float))
+        return _trim_at(model, t, self.travel), u
 
     def turns(self, model: ControlAffine) -> bool:
         """Tell that the heading stays."""
@@ -104,15 +113,21 @@ class RestingPath(LeaderPath):
         """Accept every model."""
 
 
-def resting_leader(parts: Parts) -> Law:
+def _trim_at(model: ControlAffine, t: Scalar, travel: Array | None) -> State:
+    x = jnp.asarray(np.asarray(model.trim[0], float))
+    return x if travel is None else x + travel[0] + t * travel[1]
+
+
+def resting_leader(parts: Parts, answers: bool, ahead: float) -> Law:
     """Return the leaders' law with its path at rest; at the trim where it does not react."""
     assert isinstance(parts.drive, Laws)
-    leader = parts.drive.leader
-    if not reacts(parts):
-        return RestingLeader(parts.drive.follower)
+    leader, velocity = parts.drive.leader, trim_velocity(parts.model)
+    travel = np.stack([ahead * velocity, velocity]) if velocity.any() else None
+    if not answers:
+        return RestingLeader(parts.drive.follower, travel)
     if reference_of(leader) is None:
         return leader
-    return dataclasses.replace(leader, reference=RestingPath())  # pyright: ignore
+    return dataclasses.replace(leader, reference=RestingPath(travel))  # pyright: ignore
 
 
 def reacts(parts: Parts) -> bool:
@@ -124,10 +139,13 @@ def reacts(parts: Parts) -> bool:
 # ---- the loop ------------------------------------------------------------------------------------
 
 
-def resting_loop(prepared: Prepared, graph_row: int | None, steps: int) -> Loop:
+def resting_loop(
+    prepared: Prepared, graph_row: int | None, steps: int, ahead: float = 0.0, own: bool = False
+) -> Loop:
     """Return the loop of a run at rest, for so many steps.
 
-    Of a graph that switches it has one of its rows alone, unless that is None.
+    Of a graph that switches it has one of its rows alone, unless that is None. A trim that moves
+    has done so for a time `ahead` (s). `own`: leaders keep their law, whether they react or not.
     """
     parts, problem = prepared.parts, prepared.problem
     assert isinstance(parts.drive, Laws)
@@ -137,7 +155,8 @@ def resting_loop(prepared: Prepared, graph_row: int | None, steps: int) -> Loop:
         sensors=problem.sensors.still,
         channel=None if problem.channel is None else problem.channel.still,
     )
-    loop = assemble(still, resting_leader(parts), parts.drive.follower)
+    leader = resting_leader(parts, own or reacts(parts), ahead)
+    loop = assemble(still, leader, parts.drive.follower)
     loop = loop.replace(roster=Everybody())
     if graph_row is not None and isinstance(loop.graph, SwitchingLinks):
         loop = loop.replace(graph=Links(loop.graph.exchange.during(graph_row)))
@@ -319,16 +338,25 @@ _NUMBERS = 2_000_000
 """Of all rows that are computed at a time."""
 
 
+class Span(NamedTuple):
+    """So many steps, and by how much all numbers (D,) move in one at rest; None for nothing."""
+
+    steps: Array
+    drift: Array | None
+
+
 def _moved(
-    loop: Loop, now: LoopState, free: Array, steps: Array
+    loop: Loop, now: LoopState, free: Array, span: Span
 ) -> tuple[Callable[[jax.Array], jax.Array], int]:
     """Return where numbers (d,) are after some steps, and how many there are at most in a row."""
-    rest = jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(now) if is_real(x)])
+    (steps, drift), leaves = span, jax.tree.leaves(now)
+    rest = jnp.concatenate([jnp.ravel(x) for x in leaves if is_real(x)])
 
     def moved(values: jax.Array) -> jax.Array:
         start = with_reals(now, rest.at[free].set(values))
         end = jax.lax.fori_loop(0, steps, lambda _, now: step(loop, now), start)
-        return jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(end) if is_real(x)])[free]
+        after = jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(end) if is_real(x)])[free]
+        return after if drift is None else after - steps * drift[free]
 
     # As many rows at a time as memory takes.
     return moved, max(1, _NUMBERS // len(rest))
@@ -336,7 +364,7 @@ def _moved(
 
 @compiled_for_one_call
 def slopes_along(
-    loop: Loop, now: LoopState, free: Array, base: Array, directions: Array, steps: Array
+    loop: Loop, now: LoopState, free: Array, base: Array, directions: Array, span: Span
 ) -> tuple[jax.Array, jax.Array]:
     """Return where numbers are after some steps, and the derivative along directions, (K, d) each.
 
@@ -346,15 +374,15 @@ def slopes_along(
         free: (d,) the places of the numbers that may move.
         base: (d,) their values, the same for all directions: only slopes are computed K times.
         directions: (K, d).
-        steps: how many.
+        span: how many steps.
     """
-    moved, rows = _moved(loop, now, free, steps)
+    moved, rows = _moved(loop, now, free, span)
     start = (jnp.asarray(base),)
     return jax.lax.map(lambda d: jax.jvp(moved, start, (d,)), directions, batch_size=rows)
 
 
 @compiled_for_one_call
-def values_after(loop: Loop, now: LoopState, free: Array, bases: Array, steps: Array) -> jax.Array:
+def values_after(loop: Loop, now: LoopState, free: Array, bases: Array, span: Span) -> jax.Array:
     """Return where numbers are after some steps from each of K values (K, d), likewise."""
-    moved, rows = _moved(loop, now, free, steps)
+    moved, rows = _moved(loop, now, free, span)
     return jax.lax.map(moved, bases, batch_size=rows)

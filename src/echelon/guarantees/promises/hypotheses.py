@@ -13,6 +13,7 @@ import numpy as np
 from echelon.agents.models.linearization import at_trim
 from echelon.agents.models.model import ControlAffine, position_unit
 from echelon.agents.models.model_check import Shortfall, at_limits, is_limited, trim_shortfall
+from echelon.agents.models.relative_equilibrium import trim_speed, trim_velocity
 from echelon.agents.network.events import Cut, Event, Join, agents_of
 from echelon.agents.network.graph import Graph
 from echelon.agents.world.actuator import Actuator
@@ -36,6 +37,7 @@ from echelon.guarantees.promises.case import GuaranteeInputs
 from echelon.guarantees.promises.leaders import apart
 from echelon.guarantees.promises.modes import modes
 from echelon.guarantees.promises.promise import Guarantee
+from echelon.guarantees.promises.turning_lag import turning_lag
 from echelon.laws.law import Law, Proves
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.drive import Controller
@@ -76,10 +78,12 @@ def _trim_applied(case: GuaranteeInputs) -> Statement:
     """Definition 1 wants f(0) = 0: about the trim it holds, if the law applies the trim input."""
     parts = case.parts
     there = np.zeros_like(parts.formation.offsets)
-    size = float(np.abs(goal_drifts(parts.model, there, parts.drive)).max())
+    drifts = goal_drifts(parts.model, there, parts.drive) - trim_velocity(parts.model)
+    size, speed = float(np.abs(drifts).max()), trim_speed(parts.model)
     number = size, f"|f + g u*| {at_least(size, 2)}"
     if parts.drive.trimmed or not np.any(np.asarray(parts.model.trim[1], float)):
-        text = "holds about the trim, since the law applies the trim input"
+        about_it = f"the trim, which moves at {about(speed)}" if speed else "the trim"
+        text = f"holds about {about_it}, since the law applies the trim input"
         return holds(Hypothesis.TRIM_APPLIED, Kind.PROOF, text, *number)
     text, remedy = "the law leaves out the trim input", "set `follower.trim: true`"
     return fails(Hypothesis.TRIM_APPLIED, Kind.PROOF, text, *number, remedy=remedy, reason=text)
@@ -200,7 +204,14 @@ def _symmetric(case: GuaranteeInputs) -> Statement:
     if formation.motion is not None:
         text, remedy = "offsets change with time", "use the law `stopping-point`"
         reason = f"{text}, and the theorems about this law are of constant ones"
-        return fails(name, Kind.PROOF, text, remedy=remedy, reason=reason)
+        lag, unit = turning_lag(case), position_unit(model)
+        if lag is None:
+            return fails(name, Kind.PROOF, text, remedy=remedy, reason=reason)
+        text += (
+            f"; turning with the leader, followers end up to {at_least(lag)} {unit} off their goals"
+        )
+        number = lag, f"{at_least(lag)} {unit} off"
+        return fails(name, Kind.PROOF, text, *number, remedy=remedy, reason=reason)
     if not np.ptp(formation.offsets, axis=0).any():
         return unneeded(name, Kind.PROOF, "there are none")
     broken = formation.broken_symmetries(model)

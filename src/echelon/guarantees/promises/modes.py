@@ -13,9 +13,10 @@ from echelon.agents.models.heading_symmetry import (
     state_turn,
 )
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.models.relative_equilibrium import moves, path_states
 from echelon.core.compiled import cached_jit
 from echelon.core.digits import about, at_least, at_most
-from echelon.core.linear import sampled_radius
+from echelon.core.linear import newton_least, sampled_radius
 from echelon.core.rational import bisect
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded, vacuous
 from echelon.core.types import Array
@@ -23,10 +24,9 @@ from echelon.core.words import Kind, Theorem, amount
 from echelon.guarantees.local.local_certificate import LocalCertificate
 from echelon.guarantees.local.local_lines import local_lines
 from echelon.guarantees.promises.case import GuaranteeInputs
-from echelon.laws.law import gain_of
+from echelon.guarantees.promises.speeds import slowest_about, speed_lines
 from echelon.simulation.engine.law_drive import Laws
 from echelon.synthesis.certificates.margins import detectability
-from echelon.synthesis.gains.gain import Gain
 
 # ---- a law whose gain turns with the heading -----------------------------------------------------
 # Where f and g turn with the heading, the guarantee for errors at the trim holds at any constant
@@ -34,9 +34,9 @@ from echelon.synthesis.gains.gain import Gain
 # delta' = (A - w G - c lambda B R^-1 B'P) delta, with A and B taken there: constant again.
 
 _NAME = Hypothesis.HEADING_FRAME
-_ROUNDS, _RESIDUAL = 20, 1e-10
-"""Newton's, and what may be left of the rates, in units of the states."""
 _HALVINGS = 20
+_FREE = 1e6
+"""How much rather a place is changed than a state that the motion depends on."""
 
 
 def turns_with_heading(case: GuaranteeInputs) -> bool:
@@ -92,18 +92,8 @@ def slowest_in_turns(case: GuaranteeInputs) -> dict[float, float]:
 
 def slowest_in_turn(case: GuaranteeInputs, rate: float) -> float | None:
     """Return the slowest mode in a steady turn (rad/s) about the trim, 1/s; None without a turn."""
-    model, loop, gain = case.parts.model, case.loop, case.parts.drive.gain
-    assert isinstance(case.parts.drive, Laws) and isinstance(gain, Gain)
-    there = steady_turn(model, rate)
-    if there is None:
-        return None
-    A, B = (np.asarray(part) for part in _slopes(model, *map(jnp.asarray, there)))
-    A = A - rate * state_turn(model).slope
-    K = gain.R_inverse @ B.T @ gain.P
-    gains = [loop.inner + strength * K for strength in loop.closed.strengths]
-    own = gain_of(case.parts.drive.leader)
-    gains += [] if own is None else [own.coupling * own.R_inverse @ B.T @ own.P]
-    return float(np.linalg.eigvals(A - B @ np.array(gains)).real.max())
+    there = steady_turn(case.parts.model, rate)
+    return None if there is None else slowest_about(case, *there, rate)
 
 
 def steady_turn(model: ControlAffine, rate: float) -> tuple[Array, Array] | None:
@@ -112,15 +102,17 @@ def steady_turn(model: ControlAffine, rate: float) -> tuple[Array, Array] | None
     In axes that turn at a rate (rad/s) nothing moves there: f + g u = rate (e + G x), where e is 1
     at the heading. None where Newton's method, by least changes from the trim, finds none.
     """
-    n, z = len(model.state_names), np.concatenate([model.trim[0], np.zeros(len(model.input_names))])
-    for _ in range(_ROUNDS):
+    n, start = len(model.state_names), np.append(model.trim[0], np.zeros(len(model.input_names)))
+    # Where a trim moves, its place on the circle is free, and its speed is to stay.
+    free = np.ones(len(start))
+    free[list(path_states(model)) if moves(model) else []] = _FREE
+
+    def left(z: Array) -> tuple[Array, Array]:
         rest, slope = map(np.asarray, _left(model, jnp.asarray(z), jnp.asarray(rate)))
-        if np.abs(rest).max() <= _RESIDUAL:
-            return z[:n], z[n:]
-        if not (np.isfinite(rest).all() and np.isfinite(slope).all()):
-            return None
-        z = z - np.linalg.lstsq(slope, rest, rcond=None)[0]
-    return None
+        return rest, slope
+
+    there = newton_least(left, start, free)
+    return None if there is None else (there[:n], there[n:])
 
 
 @cached_jit
@@ -134,16 +126,6 @@ def _left(model: ControlAffine, z: jax.Array, rate: jax.Array) -> tuple[jax.Arra
         return moved.at[heading_index(model)].add(-rate)
 
     return left(z), jax.jacfwd(left)(z)
-
-
-@cached_jit
-def _slopes(model: ControlAffine, x: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the slopes of the motion at a state and a normalized input, A (n, n) and B (n, m)."""
-
-    def motion(x: jax.Array, v: jax.Array) -> jax.Array:
-        return model.velocity(x, model.physical(v))
-
-    return jax.jacfwd(motion, (0, 1))(x, v)
 
 
 def _fastest(case: GuaranteeInputs, rate: float) -> float:
@@ -190,6 +172,7 @@ def _linear(case: GuaranteeInputs, local: LocalCertificate) -> Iterator[Statemen
     yield from local_lines(case.parts, case.settings, local, shorter)
     yield _along(case)
     yield from turning(case)
+    yield from speed_lines(case) if case.governed else ()
 
 
 # ---- where the model bends ----------------------------------------------------------------------

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.models.linearization import at_trim
-from echelon.agents.models.model import ControlAffine
+from echelon.agents.models.model import ControlAffine, position_unit
 from echelon.agents.models.model_check import check_model
+from echelon.agents.models.relative_equilibrium import moves, path_states, separation
 from echelon.agents.network.channel import Channel
 from echelon.agents.network.events import event_faults
 from echelon.agents.network.formation import Formation
@@ -175,8 +176,28 @@ def _check_offsets(model: ControlAffine, parts: Parts) -> None:
             f"the formation has offsets {parts.formation.offsets.shape}, and {shape[0]} agents "
             f"with {amount(shape[1], 'state')} need {shape}."
         )
+    if moves(model):
+        _check_translations(model, parts.formation)
 
 
+def _check_translations(model: ControlAffine, formation: Formation) -> None:
+    """Check that agents that move with the trim keep their offsets."""
+    for agent, offset in enumerate(formation.offsets):
+        away = separation(model, offset - formation.offsets[0])
+        if np.abs(away).max() > _KEPT:
+            along = np.abs(away[list(path_states(model))])
+            size = float(np.linalg.norm(along)) or float(np.abs(away).max())
+            unit = f"{position_unit(model)}/s" if along.any() and model.position else "per second"
+            names = [n for n, x in zip(model.state_names, offset, strict=True) if x]
+            raise SimulationError(
+                f"the offset of agent {agent} in {listing(names)} separates it from the leader by "
+                f"{size:.3g} {unit} for ever, since the trim of `{type(model).__name__}` moves; "
+                "offset only what neither f nor g uses, such as positions."
+            )
+
+
+_KEPT = 1e-9
+"""1/s, in the unit of each state: agents that separate no faster keep their offsets."""
 _HALF_TURN = 3.0
 """Below half a turn in rad: no smaller spread is looked at, since `difference` is compiled."""
 _MET = 1e-9
