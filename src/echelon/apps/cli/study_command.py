@@ -1,6 +1,7 @@
 """`echelon check`, `causes`, `design` and `compare`: studies of a scenario."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,6 +10,7 @@ import typer
 from echelon.apps.cli import options, tables
 from echelon.apps.cli.options import JsonOption, ScenarioArgument, SetOption
 from echelon.apps.cli.terminal import STATUS, STOP
+from echelon.core.errors import LawError, ScenarioError
 from echelon.output.archive.folder import claim_design, write_errors
 
 if TYPE_CHECKING:
@@ -16,7 +18,6 @@ if TYPE_CHECKING:
     from echelon.experiments.scenario.build import Experiment
     from echelon.experiments.scenario.scenario import Scenario
     from echelon.experiments.studies.causes import CauseStudy
-    from echelon.experiments.studies.compare import Comparison
     from echelon.experiments.studies.observed_region import ObservedRegion
     from echelon.simulation.engine.parts import Parts
     from echelon.simulation.engine.result import Result
@@ -185,7 +186,16 @@ def compare(
     ],
     horizon: Annotated[float, typer.Option(help="Duration of every run, s.")] = 10.0,
     method: Annotated[
-        list[str] | None, typer.Option(help="Only this method; repeat the option for several.")
+        list[str] | None,
+        typer.Option(
+            help="Only this method, or a law of yours as in `follower.law`; repeat for several."
+        ),
+    ] = None,
+    seeds: Annotated[
+        str | None,
+        typer.Option(
+            metavar="0..199", help="Run all methods on each seed; without --method only laws."
+        ),
     ] = None,
     set_: options.SetOption = None,
     out: options.FolderOption = None,
@@ -205,18 +215,19 @@ def compare(
     from echelon.experiments.scenario.build import build
     from echelon.experiments.studies.compare import known_labels
     from echelon.output.archive.folder import claim_folders
-    from echelon.output.reports.comparison_report import comparison_mapping
 
-    labels = known_labels(method)
+    drawn = None if seeds is None else _read_seeds(seeds)
+    labels = known_labels(method, slow=drawn is None)
     experiments = [build(scenario, to_run=True) for scenario in loaded]
     folders = claim_folders([scenario.name for scenario in loaded], out, force)
     with STOP.hold():
-        comparisons = [
-            _compare(*job, labels, figures, as_json, as_latex)
-            for job in zip(loaded, experiments, folders, strict=True)
+        jobs = zip(loaded, experiments, folders, strict=True)
+        how = labels, figures, as_json, as_latex
+        rows = [
+            _compare(*job, *how) if drawn is None else _compare_seeds(*job, drawn, *how)
+            for job in jobs
         ]
     if as_json:
-        rows = [comparison_mapping(comparison) for comparison in comparisons]
         print(json.dumps(rows[0] if len(rows) == 1 else rows, indent=2))
     raise typer.Exit(STOP.exit_code)
 
@@ -229,7 +240,7 @@ def _compare(
     figures: bool,
     quiet: bool,
     as_latex: bool,
-) -> "Comparison":
+) -> "JsonObject":
     from echelon.experiments.studies.compare import compare as simulate
     from echelon.output.archive.study_folder import Flights, write_comparison
     from echelon.output.reports.comparison_report import (
@@ -238,13 +249,9 @@ def _compare(
         print_comparison,
     )
 
-    def progress(label: str, done: float, methods: int) -> None:
-        STATUS.count(done, methods, f"methods, now {label}")
-        STOP.check()
-
     flights = Flights(folder)
     STATUS.begin(f"comparing on {scenario.name}", not quiet)
-    comparison = simulate(scenario, experiment, labels, progress, flights.write)
+    comparison = simulate(scenario, experiment, labels, _progress, flights.write)
     # Printed before anything more is written, so that a full disk loses nothing of it.
     if not quiet:
         print_comparison(tables.console(as_latex=as_latex), comparison)
@@ -253,4 +260,46 @@ def _compare(
     write_comparison(comparison, rows, text, folder, figures)
     if not quiet:
         tables.print_folder(folder)
-    return comparison
+    return rows
+
+
+def _progress(label: str, done: float, methods: int) -> None:
+    STATUS.count(done, methods, f"methods, now {label}")
+    STOP.check()
+
+
+def _read_seeds(text: str) -> Sequence[int]:
+    from echelon.experiments.sweeps.plan import read_axes
+
+    try:
+        (axis,) = read_axes([f"seed={text}"])
+    except ScenarioError as error:
+        raise ScenarioError(str(error).replace("--over seed=", "--seeds ")) from error
+    if not all(isinstance(seed, int) and seed >= 0 for seed in axis.values):
+        raise LawError(f"`--seeds` is `{text}`, and must be whole numbers from 0 on, as `0..199`.")
+    return axis.values
+
+
+def _compare_seeds(
+    scenario: "Scenario",
+    experiment: "Experiment",
+    folder: Path,
+    seeds: Sequence[int],
+    labels: tuple[str, ...],
+    figures: bool,
+    quiet: bool,
+    as_latex: bool,
+) -> "JsonObject":
+    from echelon.experiments.studies.seed_comparison import compare_seeds
+    from echelon.output.archive.study_folder import write_seeds
+    from echelon.output.reports.seed_report import print_seeds, seed_mapping, seed_report
+
+    STATUS.begin(f"comparing on {scenario.name}, {len(seeds)} seeds", not quiet)
+    comparison = compare_seeds(scenario, seeds, experiment, labels, _progress)
+    if not quiet:
+        print_seeds(tables.console(as_latex=as_latex), comparison)
+    rows = seed_mapping(comparison)
+    write_seeds(comparison, rows, seed_report(comparison), folder, figures)
+    if not quiet:
+        tables.print_folder(folder)
+    return rows

@@ -7,13 +7,18 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import numpy as np
 
-from echelon.core.errors import EchelonError, LawError, check_name
+from echelon.core.errors import EchelonError, LawError, ScenarioError, check_name
 from echelon.core.numerics import precision
 from echelon.core.words import Feedforward
 from echelon.experiments.results.metrics import RunNumbers, metrics
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.build import Experiment, build
-from echelon.experiments.scenario.scenario import ScenarioLike, as_scenario
+from echelon.experiments.scenario.scenario import (
+    Scenario,
+    ScenarioLike,
+    as_scenario,
+    with_overrides,
+)
 from echelon.guarantees.promises.promise import guarantee
 from echelon.laws.consensus import Consensus
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
@@ -28,7 +33,7 @@ from echelon.synthesis.gains.gain import FixedGain, Gain, Method, synthesize
 from echelon.synthesis.gains.riccati import InnerLoop, Riccati
 
 OWN = "own"
-"""Label of the scenario's drive."""
+"""Stands for the scenario's drive among the methods to run."""
 PLANNED_LEADER, PLANNED = "optimal-leader", "optimization"
 """Labels of the paper's two methods: consensus behind a planned leader, and plans alone."""
 
@@ -66,6 +71,8 @@ class Comparison(NamedTuple):
 _LAW_NAMES = {
     entry.target.rpartition(":")[2]: name for name, entry in registry.FOLLOWER_LAWS.items()
 }
+
+INTERRUPTED = "it was not run because of an interruption."
 
 DriveOf = Callable[[Parts, Settings], Controller]
 """Returns the drive of a method for the parts and the settings of a scenario."""
@@ -128,22 +135,63 @@ LABELS = tuple(_DRIVES)
 """The methods that are compared."""
 
 
-def known_labels(requested: Sequence[str] | None) -> tuple[str, ...]:
-    """Return the requested methods in the order of `LABELS`, then `own`; by default all.
+SLOW = (PLANNED_LEADER, PLANNED, "mpc")
+"""Methods that solve optimization problems, which take seconds to minutes for each run."""
+
+MethodRun = Callable[[str, DriveOf], Controller | None]
+"""Runs a method under its label, and returns the completed drive; None if nothing ran."""
+
+
+def known_labels(requested: Sequence[str] | None, slow: bool = True) -> tuple[str, ...]:
+    """Return the requested methods: of `LABELS` in their order, laws of the user's, and `own`.
+
+    A law of the user's is a mapping as that of `follower.law`, `{python: "mine.py:Law"}`. By
+    default these are all labels, without those of `SLOW` if not `slow`.
 
     Raises:
         LawError: a label is unknown.
     """
     allowed = (*LABELS, OWN)
-    for label in requested or ():
-        check_name("`--method` is", label, allowed, LawError)
-    return tuple(label for label in allowed if not requested or label in requested)
+    if not requested:
+        return tuple(label for label in allowed if slow or label not in SLOW)
+    laws = tuple(filter(_is_mapping, requested))
+    for label in requested:
+        if label not in laws:
+            check_name("`--method` is", label, allowed, LawError)
+    named = tuple(label for label in LABELS if label in requested)
+    return (*named, *laws, *[OWN][: OWN in requested])
+
+
+def _is_mapping(text: str) -> bool:
+    return text.lstrip().startswith("{")
+
+
+def run_each(scenario: Scenario, parts: Parts, only: Sequence[str], fly: MethodRun) -> None:
+    """Run each method; the scenario's own drive only if no other method has the same.
+
+    Raises:
+        ScenarioError: a law of the user's cannot be built.
+    """
+    changes = [f"follower.law={text}" for text in only if _is_mapping(text)]
+    try:
+        laws = [build(with_overrides(scenario, [change])).parts.drive for change in changes]
+    except ScenarioError as error:
+        raise ScenarioError(str(error).replace("--set follower.law=", "--method ")) from error
+    *labels, own = _labels_of([*laws, parts.drive], parts)
+    flown = {label: fly(label, _DRIVES[label]) for label in only if label in _DRIVES}
+    for label, law in zip(labels, laws, strict=True):
+        flown[label] = fly(label, lambda parts, settings, law=law: law)
+    drive = parts.drive.prepare(parts.model, parts.graph.before)
+    # By value, gains included: the scenario may describe one of the methods.
+    if OWN in only and not any(eqx.tree_equal(drive, other) for other in flown.values()):
+        own = f"{own}, own" if own in flown else own
+        fly(own, lambda parts, settings: parts.drive)
 
 
 def compare(
     scenario: ScenarioLike,
     built: Experiment | None = None,
-    only: tuple[str, ...] = (*LABELS, OWN),
+    only: Sequence[str] = (*LABELS, OWN),
     progress: Callable[[str, float, int], None] = lambda label, done, methods: None,
     landed: Callable[[ComparisonRow], None] = lambda row: None,
 ) -> Comparison:
@@ -153,7 +201,8 @@ def compare(
         scenario: the agents, their graph, formation, starts, conditions and horizon; a scenario,
             its name, its file, or a mapping.
         built: its parts and settings; built if None.
-        only: the labels of the methods; `own` for the scenario's drive.
+        only: the labels of the methods; `own` for the scenario's drive, or a law of your own as
+            the scenario writes it, `{python: "mine.py:Law", rate: 2}`.
         progress: called between chunks of steps and between runs, with the label of the method,
             how many methods are done (with a part of this one), and how many there are; if it
             raises KeyboardInterrupt, the remaining methods have a row with that reason.
@@ -171,7 +220,7 @@ def compare(
     scene = _with_starts(parts, settings)
     rows = list[ComparisonRow]()
 
-    def fly(label: str, drive: DriveOf) -> None:
+    def fly(label: str, drive: DriveOf) -> Controller | None:
         def part(done: float) -> None:
             progress(label, len(rows) + done, len(only))
 
@@ -179,17 +228,19 @@ def compare(
             part(0.0)
             rows.append(_row(label, drive, scene, settings, part))
         except KeyboardInterrupt:
-            rows.append(ComparisonRow(label, None, "it was not run because of an interruption."))
+            rows.append(ComparisonRow(label, None, INTERRUPTED))
         landed(rows[-1])
+        return None if rows[-1].flight is None else rows[-1].flight.result.drive
 
-    for label in (label for label in only if label != OWN):
-        fly(label, _DRIVES[label])
-    own = _own_label(parts, rows) if OWN in only else None
-    if own is not None:
-        fly(own, lambda parts, settings: parts.drive)
-    described = parts.world.describe(parts.model)
-    conditions = tuple(f"{name}: {text}" for name, text in described.items() if text)
+    run_each(scenario, parts, only, fly)
+    conditions = conditions_of(parts)
     return Comparison(scenario.name, tuple(rows), settings.horizon, settings.window, conditions)
+
+
+def conditions_of(parts: Parts) -> tuple[str, ...]:
+    """Return wind and plant in words; empty where there are none."""
+    described = parts.world.describe(parts.model)
+    return tuple(f"{name}: {text}" for name, text in described.items() if text)
 
 
 def _row(
@@ -238,17 +289,26 @@ class _Watch:
         return (last - first) * total / max(1, done - begun)
 
 
-def _own_label(parts: Parts, rows: list[ComparisonRow]) -> str | None:
-    """Return the label of the scenario's drive; None if another row has the same drive."""
-    drive = parts.drive.prepare(parts.model, parts.graph.before)
-    others = (row.flight.result.drive for row in rows if row.flight is not None)
-    # By value, gains included: the scenario may describe one of the methods.
-    if any(eqx.tree_equal(drive, other) for other in others):
-        return None
+def _labels_of(drives: Sequence[Controller], parts: Parts) -> list[str]:
+    """Return a label for each drive; drives of one label are told apart by numbers that differ."""
+    labels = [_label(drive.prepare(parts.model, parts.graph.before)) for drive in drives]
+    given = [_numbers(getattr(drive, "follower", drive)) for drive in drives]
+    told = list[str]()
+    for label, mine in zip(labels, given, strict=True):
+        alike = [each for each, other in zip(given, labels, strict=True) if other == label]
+        texts = [f"{k}={v}" for k, v in mine.items() if any(each.get(k) != v for each in alike)]
+        told.append(f"{label}({', '.join(texts)})" if texts else label)
+    return told
+
+
+def _numbers(law: Any) -> dict[str, object]:
+    return {name: value for name, value in vars(law).items() if isinstance(value, int | float)}
+
+
+def _label(drive: Controller) -> str:
     law, gain, feedforward = getattr(drive, "follower", drive), drive.gain, drive.feedforward
     kind = type(law).__name__
-    name = _LAW_NAMES.get(kind, kind) if gain is None else gain.method
-    label = name if feedforward is Feedforward.NONE else f"{name}-{feedforward}"
     if not type(law).__module__.startswith("echelon."):
-        label = kind
-    return f"{label}, own" if label in {row.label for row in rows} else label
+        return kind
+    name = _LAW_NAMES.get(kind, kind) if gain is None else gain.method
+    return name if feedforward is Feedforward.NONE else f"{name}-{feedforward}"

@@ -11,6 +11,7 @@ from echelon.core.types import JsonObject
 from echelon.experiments.results.dataset import save_dataset
 from echelon.experiments.scenario.scenario import SCENARIO_FILE, load_scenario
 from echelon.experiments.studies.compare import Comparison, ComparisonRow
+from echelon.experiments.studies.seed_comparison import SeedComparison
 from echelon.experiments.sweeps.plan import Sweep, read_axes
 from echelon.experiments.sweeps.sweep_dataset import SweepBatch, axis_values, write_frames
 from echelon.output.archive.chunks import Chunks
@@ -170,3 +171,25 @@ def write_comparison(
             from echelon.output.plots.study_figures import save_comparison_figures
 
             save_comparison_figures(comparison, folder)
+
+
+def write_seeds(
+    comparison: SeedComparison, summary: JsonObject, text: str, folder: Path, figures: bool = True
+) -> None:
+    """Write a comparison over seeds: numbers, text, the dataset of all runs and the figures.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    with write_errors(folder):
+        content = json.dumps(summary, indent=2, allow_nan=False)
+        write_atomic(folder / "comparison.json", content + "\n")
+        write_atomic(folder / "comparison.txt", text + "\n")
+        if not comparison.compared:
+            return
+        data = comparison.dataset().to_netcdf(None, engine="h5netcdf")
+        write_atomic(folder / RUNS / "seeds.nc", bytes(data))
+        if figures:
+            from echelon.output.plots.study_figures import save_seed_figures
+
+            save_seed_figures(comparison, folder)

@@ -1,5 +1,6 @@
 """Figures of studies: of a comparison, of a sweep, and of a design."""
 
+import itertools
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +32,7 @@ from echelon.experiments.studies.basin import (
 )
 from echelon.experiments.studies.compare import PLANNED, PLANNED_LEADER, Comparison
 from echelon.experiments.studies.observed_region import ObservedRegion
+from echelon.experiments.studies.seed_comparison import SeedComparison, differences
 from echelon.experiments.sweeps.plan import SEED, SUMMARIZED
 from echelon.experiments.sweeps.sweep_dataset import share_bounds, succeeded
 from echelon.guarantees.promises.promise import guarantee
@@ -337,6 +339,59 @@ def _cell_ends(values: Array) -> Array:
     first, last = 1.5 * places[0] - 0.5 * places[1], 1.5 * places[-1] - 0.5 * places[-2]
     ends = np.concatenate([[first], between, [last]])
     return np.exp(ends) if _is_geometric(values) else ends
+
+
+# ---- comparisons over seeds --------------------------------------------------------------------
+
+
+def seed_figures(comparison: SeedComparison) -> "dict[str, Figure]":
+    """Return the figures of a comparison over seeds, by name.
+
+    `quantiles` shows on which share of the seeds each method stays below a number, `differences`
+    on which share the number of a method less that of another does: left of 0 the first is better.
+    """
+    names = [name for name in SUMMARIZED if name in comparison.names]
+    if not names:
+        return {}
+    rows = comparison.compared
+    single = {name: [(row.label, row.ranked(name)) for row in rows] for name in names}
+    pairs = [*itertools.combinations(rows, 2)][: len(draw.COLOURS)]
+    double = {
+        name: [(f"{a.label} less {b.label}", differences(name, a, b)) for a, b in pairs]
+        for name in names
+    }
+    with draw.style():
+        drawings = {"quantiles": _shares(comparison, single, "")}
+        if pairs:
+            drawings["differences"] = _shares(comparison, double, ", difference")
+    return drawings
+
+
+def save_seed_figures(comparison: SeedComparison, folder: Path) -> None:
+    """Write each figure of a comparison over seeds as PNG and PDF under `folder`/figures.
+
+    Raises:
+        OSError: the folder or a file cannot be written.
+    """
+    save(seed_figures(comparison), folder / "figures")
+
+
+def _shares(
+    comparison: SeedComparison, curves: dict[str, list[tuple[str, Array]]], what: str
+) -> "Figure":
+    figure, (axes,) = draw.sheet(2.8, 1, len(curves))
+    for ax, (name, lines) in zip(axes, curves.items(), strict=True):
+        for k, (label, values) in enumerate(lines):
+            ordered, share = np.sort(values), np.arange(1, len(values) + 1) / len(comparison.seeds)
+            shown = np.isfinite(ordered)
+            look = draw.pen(k, draw.NAMED)
+            ax.step(ordered[shown], share[shown], where="post", label=label, **look)
+        text = RUN_NUMBERS[name].label + what
+        ax.set(ylim=(0.0, 1.02), xlabel=draw.label(text, comparison.unit(name)))
+        if what:
+            ax.axvline(0.0, **draw.MARK)
+    axes[0].set_ylabel("share of seeds below")
+    return draw.finish(figure)
 
 
 # ---- designs ----------------------------------------------------------------------------------
