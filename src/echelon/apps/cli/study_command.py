@@ -10,7 +10,7 @@ import typer
 from echelon.apps.cli import options, tables
 from echelon.apps.cli.options import JsonOption, ScenarioArgument, SetOption
 from echelon.apps.cli.terminal import STATUS, STOP
-from echelon.core.errors import LawError, ScenarioError
+from echelon.core.errors import ScenarioError
 from echelon.output.archive.folder import claim_design, write_errors
 
 if TYPE_CHECKING:
@@ -187,14 +187,12 @@ def compare(
     horizon: Annotated[float, typer.Option(help="Duration of every run, s.")] = 10.0,
     method: Annotated[
         list[str] | None,
-        typer.Option(
-            help="Only this method, or a law of yours as in `follower.law`; repeat for several."
-        ),
+        typer.Option(help="Only this method, or your law `FILE.py:CLASS`; repeat for several."),
     ] = None,
     seeds: Annotated[
         str | None,
         typer.Option(
-            metavar="0..199", help="Run all methods on each seed; without --method only laws."
+            metavar="0..199", help="Run each method on all these seeds; by default, the laws."
         ),
     ] = None,
     set_: options.SetOption = None,
@@ -213,59 +211,23 @@ def compare(
     names = ", ".join(scenario.name for scenario in loaded)
     STATUS.begin(f"comparing methods on {names}, which takes minutes", not as_json)
     from echelon.experiments.scenario.build import build
-    from echelon.experiments.studies.compare import known_labels
+    from echelon.experiments.studies.compare import known_labels, laws_of
     from echelon.output.archive.folder import claim_folders
 
     drawn = None if seeds is None else _read_seeds(seeds)
     labels = known_labels(method, slow=drawn is None)
     experiments = [build(scenario, to_run=True) for scenario in loaded]
+    for scenario, experiment in zip(loaded, experiments, strict=True):
+        laws_of(scenario, experiment.parts, labels)
     folders = claim_folders([scenario.name for scenario in loaded], out, force)
     with STOP.hold():
-        jobs = zip(loaded, experiments, folders, strict=True)
-        how = labels, figures, as_json, as_latex
         rows = [
-            _compare(*job, *how) if drawn is None else _compare_seeds(*job, drawn, *how)
-            for job in jobs
+            _compare(*job, labels, drawn, figures, as_json, as_latex)
+            for job in zip(loaded, experiments, folders, strict=True)
         ]
     if as_json:
         print(json.dumps(rows[0] if len(rows) == 1 else rows, indent=2))
     raise typer.Exit(STOP.exit_code)
-
-
-def _compare(
-    scenario: "Scenario",
-    experiment: "Experiment",
-    folder: Path,
-    labels: tuple[str, ...],
-    figures: bool,
-    quiet: bool,
-    as_latex: bool,
-) -> "JsonObject":
-    from echelon.experiments.studies.compare import compare as simulate
-    from echelon.output.archive.study_folder import Flights, write_comparison
-    from echelon.output.reports.comparison_report import (
-        comparison_mapping,
-        comparison_report,
-        print_comparison,
-    )
-
-    flights = Flights(folder)
-    STATUS.begin(f"comparing on {scenario.name}", not quiet)
-    comparison = simulate(scenario, experiment, labels, _progress, flights.write)
-    # Printed before anything more is written, so that a full disk loses nothing of it.
-    if not quiet:
-        print_comparison(tables.console(as_latex=as_latex), comparison)
-    flights.check()
-    rows, text = comparison_mapping(comparison), comparison_report(comparison)
-    write_comparison(comparison, rows, text, folder, figures)
-    if not quiet:
-        tables.print_folder(folder)
-    return rows
-
-
-def _progress(label: str, done: float, methods: int) -> None:
-    STATUS.count(done, methods, f"methods, now {label}")
-    STOP.check()
 
 
 def _read_seeds(text: str) -> Sequence[int]:
@@ -274,32 +236,48 @@ def _read_seeds(text: str) -> Sequence[int]:
     try:
         (axis,) = read_axes([f"seed={text}"])
     except ScenarioError as error:
-        raise ScenarioError(str(error).replace("--over seed=", "--seeds ")) from error
+        raise ScenarioError(str(error).replace("--over seed", "--seeds", 1)) from error
     if not all(isinstance(seed, int) and seed >= 0 for seed in axis.values):
-        raise LawError(f"`--seeds` is `{text}`, and must be whole numbers from 0 on, as `0..199`.")
+        raise ScenarioError(f"--seeds {text}: allowed are whole numbers from 0 on, as `0..199`.")
     return axis.values
 
 
-def _compare_seeds(
+def _compare(
     scenario: "Scenario",
     experiment: "Experiment",
     folder: Path,
-    seeds: Sequence[int],
     labels: tuple[str, ...],
+    seeds: Sequence[int] | None,
     figures: bool,
     quiet: bool,
     as_latex: bool,
 ) -> "JsonObject":
+    from echelon.experiments.studies.compare import compare as simulate
     from echelon.experiments.studies.seed_comparison import compare_seeds
-    from echelon.output.archive.study_folder import write_seeds
-    from echelon.output.reports.seed_report import print_seeds, seed_mapping, seed_report
+    from echelon.output.archive.study_folder import Flights, write_comparison
+    from echelon.output.reports.comparison_report import (
+        comparison_mapping,
+        comparison_report,
+        print_comparison,
+    )
 
-    STATUS.begin(f"comparing on {scenario.name}, {len(seeds)} seeds", not quiet)
-    comparison = compare_seeds(scenario, seeds, experiment, labels, _progress)
+    def progress(label: str, done: float, methods: int) -> None:
+        STATUS.count(done, methods, f"methods, now {label}")
+        STOP.check()
+
+    flights = Flights(folder)
+    STATUS.begin(f"comparing on {scenario.name}", not quiet)
+    comparison = (
+        simulate(scenario, experiment, labels, progress, flights.write)
+        if seeds is None
+        else compare_seeds(scenario, seeds, experiment, labels, progress)
+    )
+    # Printed before anything more is written, so that a full disk loses nothing of it.
     if not quiet:
-        print_seeds(tables.console(as_latex=as_latex), comparison)
-    rows = seed_mapping(comparison)
-    write_seeds(comparison, rows, seed_report(comparison), folder, figures)
+        print_comparison(tables.console(as_latex=as_latex), comparison)
+    flights.check()
+    rows, text = comparison_mapping(comparison), comparison_report(comparison)
+    write_comparison(comparison, rows, text, folder, figures)
     if not quiet:
         tables.print_folder(folder)
     return rows

@@ -260,10 +260,7 @@ RUN_NUMBERS: Mapping[str, Quantity] = {
         "s",
         "settling time",
         of=lambda run: run.metrics.settled_from,
-        shown=Appearance.SWEEP
-        | Appearance.DISTRIBUTION
-        | Appearance.COMPARISON
-        | Appearance.SEEDS,
+        shown=Appearance.SWEEP | Appearance.DISTRIBUTION | Appearance.COMPARISON | Appearance.SEEDS,
         key="settling_time_s",
         absent="never",
     ),

@@ -1,5 +1,6 @@
 """Compares methods on one scenario: the same agents, starts, limits and disturbance."""
 
+import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -19,11 +20,12 @@ from echelon.experiments.scenario.scenario import (
     as_scenario,
     with_overrides,
 )
+from echelon.experiments.scenario.yaml import inline_yaml
 from echelon.guarantees.promises.promise import guarantee
 from echelon.laws.consensus import Consensus
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 from echelon.simulation.engine.law_drive import Laws
-from echelon.simulation.engine.parts import Parts, initial_states
+from echelon.simulation.engine.parts import Parts, Starts
 from echelon.simulation.engine.simulate import RunSoFar, simulate
 from echelon.simulation.optimal.drives import Plans, RecedingHorizon
 from echelon.simulation.optimal.leader import OptimalTracking
@@ -107,7 +109,7 @@ def _behind_a_plan(parts: Parts, settings: Settings) -> Controller:
     reference, first = _reference(parts), parts.graph.leaders[0]
     if reference is None:
         raise LawError("`optimal-leader` plans along a reference, and there is none.")
-    # The plan begins where the leader does: `_with_starts` has drawn all starts.
+    # The plan begins where the leader does: `with_starts` has drawn all starts.
     start = np.asarray(parts.initial)[first] - parts.formation.offsets[first]
     with precision("float64"):
         error = start - np.asarray(OptimalTracking(reference).start(parts.model))
@@ -145,8 +147,9 @@ MethodRun = Callable[[str, DriveOf], Controller | None]
 def known_labels(requested: Sequence[str] | None, slow: bool = True) -> tuple[str, ...]:
     """Return the requested methods: of `LABELS` in their order, laws of the user's, and `own`.
 
-    A law of the user's is a mapping as that of `follower.law`, `{python: "mine.py:Law"}`. By
-    default these are all labels, without those of `SLOW` if not `slow`.
+    A law of the user's is `mine.py:Law`, or a mapping as that of `follower.law`, `{python:
+    "mine.py:Law", rate: 2}`. By default these are all labels, without those of `SLOW` if not
+    `slow`.
 
     Raises:
         LawError: a label is unknown.
@@ -154,7 +157,7 @@ def known_labels(requested: Sequence[str] | None, slow: bool = True) -> tuple[st
     allowed = (*LABELS, OWN)
     if not requested:
         return tuple(label for label in allowed if slow or label not in SLOW)
-    laws = tuple(filter(_is_mapping, requested))
+    laws = tuple(dict.fromkeys(filter(_is_law, requested)))
     for label in requested:
         if label not in laws:
             check_name("`--method` is", label, allowed, LawError)
@@ -162,8 +165,8 @@ def known_labels(requested: Sequence[str] | None, slow: bool = True) -> tuple[st
     return (*named, *laws, *[OWN][: OWN in requested])
 
 
-def _is_mapping(text: str) -> bool:
-    return text.lstrip().startswith("{")
+def _is_law(text: str) -> bool:
+    return text.lstrip().startswith("{") or ".py:" in text
 
 
 def run_each(scenario: Scenario, parts: Parts, only: Sequence[str], fly: MethodRun) -> None:
@@ -172,20 +175,36 @@ def run_each(scenario: Scenario, parts: Parts, only: Sequence[str], fly: MethodR
     Raises:
         ScenarioError: a law of the user's cannot be built.
     """
-    changes = [f"follower.law={text}" for text in only if _is_mapping(text)]
-    try:
-        laws = [build(with_overrides(scenario, [change])).parts.drive for change in changes]
-    except ScenarioError as error:
-        raise ScenarioError(str(error).replace("--set follower.law=", "--method ")) from error
-    *labels, own = _labels_of([*laws, parts.drive], parts)
+    laws = laws_of(scenario, parts, only)
     flown = {label: fly(label, _DRIVES[label]) for label in only if label in _DRIVES}
-    for label, law in zip(labels, laws, strict=True):
+    for label, law in laws.items():
         flown[label] = fly(label, lambda parts, settings, law=law: law)
     drive = parts.drive.prepare(parts.model, parts.graph.before)
     # By value, gains included: the scenario may describe one of the methods.
     if OWN in only and not any(eqx.tree_equal(drive, other) for other in flown.values()):
-        own = f"{own}, own" if own in flown else own
-        fly(own, lambda parts, settings: parts.drive)
+        label = _label(drive)
+        fly(f"{label}, own" if label in flown else label, lambda parts, settings: parts.drive)
+
+
+def laws_of(scenario: Scenario, parts: Parts, only: Sequence[str]) -> dict[str, Controller]:
+    """Return the user's laws by their class, with the keys in which those of one class differ.
+
+    Raises:
+        ScenarioError: one cannot be built.
+    """
+    keys, drives = list[Mapping[str, object]](), list[Controller]()
+    for text in filter(_is_law, only):
+        law = text if text.lstrip().startswith("{") else f"{{python: {json.dumps(text)}}}"
+        changed, built = _with_law(scenario, law)
+        drives.append(built.parts.drive)
+        keys.append(changed.data["follower"]["law"])
+    kinds = [_label(drive.prepare(parts.model, parts.graph.before)) for drive in drives]
+    labels = list[str]()
+    for kind, mine in zip(kinds, keys, strict=True):
+        alike = [other for other, name in zip(keys, kinds, strict=True) if name == kind]
+        differ = {k: v for k, v in mine.items() if any(other.get(k) != v for other in alike)}
+        labels.append(kind + f"({inline_yaml(differ)[1:-1]})" * bool(differ))
+    return dict(zip(labels, drives, strict=True))
 
 
 def compare(
@@ -217,7 +236,7 @@ def compare(
     """
     scenario = as_scenario(scenario)
     parts, settings = build(scenario) if built is None else built
-    scene = _with_starts(parts, settings)
+    [scene] = with_starts(parts, [settings.seed])
     rows = list[ComparisonRow]()
 
     def fly(label: str, drive: DriveOf) -> Controller | None:
@@ -254,13 +273,13 @@ def _row(
         return ComparisonRow(label, None, str(error))
 
 
-def _with_starts(parts: Parts, settings: Settings) -> Parts:
-    """Return the parts with random starts drawn once, the leader's error included."""
+def with_starts(parts: Parts, seeds: Sequence[int]) -> list[Parts]:
+    """Return the parts with the starts of each seed, the leader's error included."""
     with precision("float64"):
         drive = parts.drive.prepare(parts.model, parts.graph.before)
-        states = initial_states(parts.replace(drive=drive), settings.seed)
+        starts = Starts(parts.replace(drive=drive)).of(seeds)
     # The states contain the leader's error already.
-    return parts.replace(initial=states, start_error={})
+    return [parts.replace(initial=states, start_error={}) for states in starts]
 
 
 def _fly(parts: Parts, settings: Settings, part: Callable[[float], None]) -> RunNumbers:
@@ -289,20 +308,15 @@ class _Watch:
         return (last - first) * total / max(1, done - begun)
 
 
-def _labels_of(drives: Sequence[Controller], parts: Parts) -> list[str]:
-    """Return a label for each drive; drives of one label are told apart by numbers that differ."""
-    labels = [_label(drive.prepare(parts.model, parts.graph.before)) for drive in drives]
-    given = [_numbers(getattr(drive, "follower", drive)) for drive in drives]
-    told = list[str]()
-    for label, mine in zip(labels, given, strict=True):
-        alike = [each for each, other in zip(given, labels, strict=True) if other == label]
-        texts = [f"{k}={v}" for k, v in mine.items() if any(each.get(k) != v for each in alike)]
-        told.append(f"{label}({', '.join(texts)})" if texts else label)
-    return told
-
-
-def _numbers(law: Any) -> dict[str, object]:
-    return {name: value for name, value in vars(law).items() if isinstance(value, int | float)}
+def _with_law(scenario: Scenario, law: str) -> tuple[Scenario, Experiment]:
+    """Return a scenario under a law, with gain and feed-forward if the law takes them."""
+    for change in (f"follower.law={law}", f"follower={{law: {law}}}"):
+        try:
+            changed = with_overrides(scenario, [change])
+            return changed, build(changed)
+        except ScenarioError as error:
+            why = str(error).replace(f"--set {change}", f"--method {law}")
+    raise ScenarioError(why)
 
 
 def _label(drive: Controller) -> str:

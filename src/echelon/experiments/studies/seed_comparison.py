@@ -3,16 +3,15 @@
 import itertools
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple, final
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
 
 from echelon.core.errors import EchelonError, LawError, Outcome
 from echelon.core.limits import excess_runs
-from echelon.core.numerics import precision
 from echelon.core.types import Array
-from echelon.experiments.results.metrics import RunNumbers, metrics
+from echelon.experiments.results.metrics import RunNumbers, arrived, metrics
 from echelon.experiments.results.run_numbers import ERROR, RUN_NUMBERS, Appearance, shown_in
 from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.scenario.scenario import ScenarioLike, as_scenario
@@ -22,71 +21,66 @@ from echelon.experiments.studies.compare import (
     conditions_of,
     known_labels,
     run_each,
+    with_starts,
 )
+from echelon.experiments.sweeps.workers import FRAMES, batch_size
 from echelon.simulation.engine.batch import Batch, Run
-from echelon.simulation.engine.parts import Parts, Starts
+from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.result import Result
 from echelon.simulation.step.drive import Controller
-from echelon.simulation.step.settings import Settings
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 LEVELS = (0.05, 0.5, 0.95)
 """The quantiles that are stated."""
 NUMBERS = tuple(shown_in(RUN_NUMBERS, Appearance.SEEDS))
-REFUSED = "refused"
-"""In place of an outcome: of a run that could not start."""
-_FRAMES, _AGENT_STEPS = 20, 20_000_000
-"""Frames of a run, and agents times steps that are simulated together."""
+_COMPLETED, _REFUSED = Outcome.COMPLETED.name.lower(), "refused"
 
 
 class MethodSeeds(NamedTuple):
-    """The runs of a method, one for each seed.
+    """The runs of a method, one for each seed; fewer if an interruption ended them.
 
     Attributes:
         label: of the method.
+        outcomes: (K,) how each run ended, in one word; `refused` if it could not start.
         numbers: (K,) by name; NaN where a run has none, as after it diverged.
-        outcomes: (K,) how each run ended, in one word.
-        reason: why runs were refused, or why there are none; empty otherwise.
+        reason: why there are no runs, fewer than seeds, or refused ones; empty otherwise.
     """
 
     label: str
+    outcomes: Sequence[str] = ()
     numbers: Mapping[str, Array] = {}
-    outcomes: tuple[str, ...] = ()
     reason: str = ""
+
+    @property
+    def settled(self) -> int:
+        """How many runs completed with all followers settled."""
+        completed = np.array(self.outcomes) == _COMPLETED
+        return int(arrived(completed, self.numbers["worst_settling_time"]).sum())
 
     @property
     def ended(self) -> Counter[str]:
         """How many runs ended in which way."""
         return Counter(self.outcomes)
 
-    @property
-    def settled(self) -> int:
-        """How many runs completed with all followers settled."""
-        times = self.numbers["worst_settling_time"]
-        return int(np.sum((np.array(self.outcomes) == _COMPLETED) & np.isfinite(times)))
-
     def ranked(self, name: str) -> Array:
-        """Return a number of all runs; one that does not exist counts as worse than any."""
+        """Return a number (K,) of all runs; infinitely bad where it does not exist."""
         worst = -np.inf if RUN_NUMBERS[name].more_is_better else np.inf
         return np.where(np.isnan(self.numbers[name]), worst, self.numbers[name])
 
-    def quantiles(self, name: str) -> tuple[float, ...]:
-        """Return the quantiles of `LEVELS`, each the number of some run."""
-        return observed_quantiles(self.ranked(name), LEVELS)
+    def quantiles(self, name: str) -> list[float]:
+        """Return the quantiles of `LEVELS`; infinite where too many runs have no number."""
+        return quantiles(self.ranked(name), LEVELS)
 
 
 class PairedDifference(NamedTuple):
-    """A number of a method less that of another, seed by seed.
+    """A number of a method minus that of another, seed by seed.
 
     Attributes:
         number: its name.
         first, second: the labels of the methods.
         median: of the differences; NaN if no seed has one.
-        interval: contains the median of all seeds with 95 %, by the sign test; None for too few.
+        interval: contains the median of all seeds with 95 %, by the sign test; None for fewer than
+            6 differences.
         better: on how many seeds the first and the second is better; neither on the others.
-        seeds: how many there are.
     """
 
     number: str
@@ -95,7 +89,6 @@ class PairedDifference(NamedTuple):
     median: float
     interval: tuple[float, float] | None
     better: tuple[int, int]
-    seeds: int
 
 
 class SeedComparison(NamedTuple):
@@ -111,25 +104,27 @@ class SeedComparison(NamedTuple):
     """
 
     scenario: str
-    seeds: tuple[int, ...]
-    rows: tuple[MethodSeeds, ...]
+    seeds: Sequence[int]
+    rows: Sequence[MethodSeeds]
     horizon: float
-    conditions: tuple[str, ...]
+    conditions: Sequence[str]
     length_unit: str
 
     @property
     def compared(self) -> list[MethodSeeds]:
-        """The methods that ran."""
-        return [row for row in self.rows if row.outcomes]
+        """The methods that ran on all seeds."""
+        return [row for row in self.rows if len(row.outcomes) == len(self.seeds)]
 
     @property
     def names(self) -> list[str]:
         """The numbers that some run has."""
-        return [
-            name
-            for name in NUMBERS
-            if any(np.isfinite(row.numbers[name]).any() for row in self.compared)
-        ]
+        rows = self.compared
+        return [x for x in NUMBERS if any(np.isfinite(row.numbers[x]).any() for row in rows)]
+
+    @property
+    def equal(self) -> bool:
+        """Whether all seeds give the same runs, as where nothing is random."""
+        return all(len({*row.ranked(x)}) < 2 for x in self.names for row in self.compared)
 
     def unit(self, name: str) -> str:
         """Return the unit of a number."""
@@ -140,36 +135,14 @@ class SeedComparison(NamedTuple):
         for name, pair in itertools.product(self.names, itertools.combinations(self.compared, 2)):
             yield _paired(name, *pair)
 
-    def dataset(self) -> "xr.Dataset":
-        """Return the numbers and outcomes of all runs, with the dimensions method and seed."""
-        import xarray as xr
 
-        rows, over = self.compared, ("method", "seed")
-        variables = {
-            name: (
-                over,
-                np.stack([row.numbers[name] for row in rows]),
-                {"long_name": RUN_NUMBERS[name].meaning, "units": self.unit(name)},
-            )
-            for name in self.names
-        }
-        outcomes = np.array([row.outcomes for row in rows], object)
-        labels = np.array([row.label for row in rows], object)
-        coordinates = {"method": labels, "seed": list(self.seeds)}
-        about = {"scenario": self.scenario, "horizon_s": self.horizon}
-        return xr.Dataset({**variables, "outcome": (over, outcomes)}, coordinates, about)
-
-
-_COMPLETED = Outcome.COMPLETED.name.lower()
-
-
-def observed_quantiles(values: Array, levels: Sequence[float]) -> tuple[float, ...]:
-    """Return quantiles that are members of `values`, infinite ones too; NaN of no values."""
-    ordered = np.sort(values)
-    if not len(ordered):
-        return (np.nan,) * len(levels)
-    places = np.maximum(np.ceil(np.multiply(levels, len(ordered)) - 1e-9).astype(int), 1) - 1
-    return tuple(ordered[places].tolist())
+def quantiles(values: Array, levels: Sequence[float]) -> list[float]:
+    """Return quantiles of values (K,) as numpy does, of infinite values too; NaN of no values."""
+    if not len(values):
+        return [np.nan] * len(levels)
+    # Between a finite number and a huge one, numpy interpolates to a huge one.
+    found = np.quantile(np.clip(values, -1e300, 1e300), levels)
+    return np.where(np.abs(found) > 1e200, np.copysign(np.inf, found), found).tolist()
 
 
 def median_interval(values: Array) -> tuple[float, float] | None:
@@ -186,20 +159,18 @@ def median_interval(values: Array) -> tuple[float, float] | None:
 
 
 def differences(name: str, first: MethodSeeds, second: MethodSeeds) -> Array:
-    """Return a number less that of another method on each seed, without those that neither has."""
+    """Return a number minus that of another method on each seed, without those that neither has."""
     mine, other = first.ranked(name), second.ranked(name)
     some = np.isfinite(mine) | np.isfinite(other)
     return mine[some] - other[some]
 
 
 def _paired(name: str, first: MethodSeeds, second: MethodSeeds) -> PairedDifference:
-    mine, other = first.ranked(name), second.ranked(name)
-    sign = -1.0 if RUN_NUMBERS[name].more_is_better else 1.0
-    better = int(np.sum(sign * mine < sign * other)), int(np.sum(sign * mine > sign * other))
     found = differences(name, first, second)
-    (median,) = observed_quantiles(found, [0.5])
-    interval = median_interval(found)
-    return PairedDifference(name, first.label, second.label, median, interval, better, len(mine))
+    less, more = int(np.sum(found < 0.0)), int(np.sum(found > 0.0))
+    better = (more, less) if RUN_NUMBERS[name].more_is_better else (less, more)
+    (median,), interval = quantiles(found, [0.5]), median_interval(found)
+    return PairedDifference(name, first.label, second.label, median, interval, better)
 
 
 def compare_seeds(
@@ -216,7 +187,7 @@ def compare_seeds(
         seeds: of the runs.
         built: its parts and settings; built if None.
         only: as in `compare`; by default the laws, without methods that optimize.
-        progress: as in `compare`.
+        progress: as in `compare`; the runs before an interruption are kept.
 
     A run that diverges or is refused has no errors, and counts as worse than all that have.
 
@@ -228,103 +199,93 @@ def compare_seeds(
     only = known_labels(None, slow=False) if only is None else only
     _check(seeds, len(only))
     parts, settings = build(scenario) if built is None else built
-    settings = settings._replace(store_every=-(-settings.steps // _FRAMES))
-    drawn = _Drawn(parts, settings, seeds)
-    rows = list[MethodSeeds]()
+    settings = settings._replace(store_every=-(-settings.steps // FRAMES))
+    drawn = [settings._replace(seed=seed) for seed in seeds]
+    scenes = [*zip(with_starts(parts, seeds), drawn, strict=True)]
+    rows, batch, units = list[MethodSeeds](), Batch(), [""]
 
     def fly(label: str, drive: DriveOf) -> Controller | None:
         def part(done: float) -> None:
-            progress(label, len(rows) + done, len(only))
+            progress(label, len(rows) + done / len(seeds), len(only))
 
-        try:
-            part(0.0)
-            row, flown = drawn.row(label, drive, part)
-        except EchelonError as error:
-            row, flown = MethodSeeds(label, reason=str(error)), None
-        except KeyboardInterrupt:
-            row, flown = MethodSeeds(label, reason=INTERRUPTED), None
+        row, first = _row(label, _results(batch, parts, scenes, drive, part))
         rows.append(row)
-        return flown
+        if first is None:
+            return None
+        units.append(first.length_unit)
+        return first.drive
 
     run_each(scenario, parts, only, fly)
-    about = settings.horizon, conditions_of(parts), drawn.unit
-    return SeedComparison(scenario.name, seeds, tuple(rows), *about)
+    about = settings.horizon, conditions_of(parts), units[-1]
+    return SeedComparison(scenario.name, seeds, rows, *about)
 
 
 def _check(seeds: Sequence[int], methods: int) -> None:
     if not seeds or len({*seeds}) < len(seeds) or min(seeds) < 0:
-        raise LawError("`--seeds` must be one or more different whole numbers from 0 on.")
+        raise LawError("`seeds` must be one or more different whole numbers from 0 on.")
     excess = excess_runs(len(seeds) * methods)
     if excess is not None:
-        raise LawError(f"`--seeds`: {excess}.")
+        raise LawError(f"`seeds`: {excess}.")
 
 
-@final
-class _Drawn:
-    """The starts of a scenario's drive for each seed, which all methods have in common."""
+def _results(
+    batch: Batch,
+    parts: Parts,
+    scenes: Sequence[Run],
+    drive: DriveOf,
+    part: Callable[[float], None],
+) -> Iterator[Result | EchelonError]:
+    part(0.0)
+    runs, size = _runs(parts, scenes, drive), batch_size(parts, scenes[0][1])
+    for done in range(0, len(runs), size):
+        some = runs[done : done + size]
 
-    def __init__(self, parts: Parts, settings: Settings, seeds: Sequence[int]) -> None:
-        self.parts, self.seeds, self.batch, self.unit = parts, seeds, Batch(), ""
-        self.settings = [settings._replace(seed=seed) for seed in seeds]
-        self.states = self._starts(parts)
-        each = _AGENT_STEPS // (settings.steps * parts.graph.agents)
-        self.size = int(np.clip(each, 16, 1000))
+        def report(step: int, of: int, done: int = done, count: int = len(some)) -> None:
+            part(done + count * step / of)
 
-    def _starts(self, parts: Parts) -> Array:
-        with precision("float64"):
-            drive = parts.drive.prepare(parts.model, parts.graph.before)
-            return Starts(parts.replace(drive=drive)).of(self.seeds)
-
-    def _at(self, k: int) -> Parts:
-        # The states contain the leader's error already.
-        return self.parts.replace(initial=self.states[k], start_error={})
-
-    def _runs(self, drive: DriveOf) -> list[Run]:
-        """Return the runs of a method; of the same parts where neither drive nor start differs."""
-        ends = [drive(self._at(k), self.settings[k]) for k in (0, -1)]
-        whole = self.parts.replace(drive=ends[0])
-        if eqx.tree_equal(*ends) and np.array_equal(self._starts(whole), self.states):
-            return [(whole, settings) for settings in self.settings]
-        return [
-            (self._at(k).replace(drive=drive(self._at(k), settings)), settings)
-            for k, settings in enumerate(self.settings)
-        ]
-
-    def row(
-        self, label: str, drive: DriveOf, part: Callable[[float], None]
-    ) -> tuple[MethodSeeds, Controller | None]:
-        """Return the runs of a method, and the drive that flew, of the first if they differ."""
-        runs, flown = self._runs(drive), None
-        numbers: dict[str, list[float]] = {name: [] for name in NUMBERS}
-        outcomes, reason = list[str](), ""
-        for first in range(0, len(runs), self.size):
-            some = runs[first : first + self.size]
-
-            def report(done: int, steps: int, before: int = first, of: int = len(some)) -> None:
-                part((before + of * done / steps) / len(runs))
-
-            for result in self.batch.fly(some, report):
-                if isinstance(result, EchelonError):
-                    reason = reason or str(result)
-                elif result.outcome in (Outcome.INTERRUPTED, Outcome.STOPPED):
-                    raise KeyboardInterrupt
-                else:
-                    flown, self.unit = flown or result.drive, result.length_unit
-                for name, number in _numbers(result):
-                    numbers[name].append(number)
-                outcomes.append(_ended(result))
-        if flown is None:
-            return MethodSeeds(label, reason=reason), None
-        arrays = {name: np.array(values) for name, values in numbers.items()}
-        return MethodSeeds(label, arrays, tuple(outcomes), reason), flown
+        yield from batch.fly(some, report)
 
 
-def _ended(result: Result | EchelonError) -> str:
-    return REFUSED if isinstance(result, EchelonError) else result.outcome.name.lower()
+def _runs(parts: Parts, scenes: Sequence[Run], drive: DriveOf) -> Sequence[Run]:
+    """Return the runs of a method; of the same parts, if neither its drive nor starts differ."""
+    first, last = (drive(*scenes[k]) for k in (0, -1))
+    whole = parts.replace(drive=first)
+    starts = with_starts(whole, [settings.seed for _, settings in scenes])
+    alike = (eqx.tree_equal(a.initial, b.initial) for a, (b, _) in zip(starts, scenes, strict=True))
+    if eqx.tree_equal(first, last) and all(alike):
+        return [(whole, settings) for _, settings in scenes]
+    return [(own.replace(drive=drive(own, settings)), settings) for own, settings in scenes]
 
 
-def _numbers(result: Result | EchelonError) -> Iterator[tuple[str, float]]:
-    run = None if isinstance(result, EchelonError) else RunNumbers(result, metrics(result))
-    for name in NUMBERS:
-        number = None if run is None else run.number(name)
-        yield name, np.nan if number is None else float(number)
+def _row(label: str, results: Iterator[Result | EchelonError]) -> tuple[MethodSeeds, Result | None]:
+    """Return the runs of a method, and the first that was not refused."""
+    outcomes, numbers, reason, first = list[str](), list[list[float]](), "", None
+    try:
+        for result in results:
+            if isinstance(result, EchelonError):
+                reason = reason or str(result)
+            elif result.outcome in (Outcome.INTERRUPTED, Outcome.STOPPED):
+                raise KeyboardInterrupt
+            first = first or (result if isinstance(result, Result) else None)
+            numbers.append(_numbers(result))
+            outcomes.append(_word(result))
+    except EchelonError as error:
+        reason = str(error)
+    except KeyboardInterrupt:
+        reason = INTERRUPTED
+    if first is None:
+        return MethodSeeds(label, reason=reason), None
+    columns = dict(zip(NUMBERS, np.array(numbers).T, strict=True))
+    return MethodSeeds(label, outcomes, columns, reason), first
+
+
+def _word(result: Result | EchelonError) -> str:
+    return _REFUSED if isinstance(result, EchelonError) else result.outcome.name.lower()
+
+
+def _numbers(result: Result | EchelonError) -> list[float]:
+    if isinstance(result, EchelonError):
+        return [np.nan] * len(NUMBERS)
+    run = RunNumbers(result, metrics(result))
+    found = (run.number(name) for name in NUMBERS)
+    return [np.nan if number is None else float(number) for number in found]

@@ -80,12 +80,15 @@ def comparison_figures(comparison: Comparison) -> "dict[str, Figure]":
     return {name: figure for name, figure in drawings.items() if figure is not None}
 
 
-def save_comparison_figures(comparison: Comparison, folder: Path) -> None:
+def save_comparison_figures(comparison: Comparison | SeedComparison, folder: Path) -> None:
     """Write each figure of a comparison as PNG and PDF under `folder`/figures.
 
     Raises:
         OSError: the folder or a file cannot be written.
     """
+    if isinstance(comparison, SeedComparison):
+        save(seed_figures(comparison), folder / "figures")
+        return
     save(comparison_figures(comparison), folder / "figures")
 
 
@@ -236,21 +239,39 @@ def _is_line(data: "xr.Dataset", key: str) -> bool:
 
 
 def _distributions(data: "xr.Dataset") -> "Figure":
-    figure, (axes,) = draw.sheet(2.8, 1, len(SUMMARIZED))
-    for ax, name in zip(axes, SUMMARIZED, strict=True):
-        values = np.sort(data[name].values.ravel())
-        values = values[np.isfinite(values)]
-        ax.set_xlabel(draw.label(RUN_NUMBERS[name].label, data[name].attrs.get("units", "")))
+    lines: dict[str, _Lines] = {}
+    for name in SUMMARIZED:
+        text = draw.label(RUN_NUMBERS[name].label, data[name].attrs.get("units", ""))
+        lines[text] = {"": data[name].values.ravel()}
+    return draw.finish(_shares(lines, data["outcome"].size, "runs"))
+
+
+_Lines = dict[str, Array]
+"""Numbers of runs by the label of their line; those that are not finite exceed all others."""
+
+
+def _shares(lines: dict[str, _Lines], total: int, of: str) -> "Figure":
+    """Return on which share of `total` runs a number stays below each value, by its name."""
+    figure, (axes,) = draw.sheet(2.8, 1, len(lines))
+    for ax, (text, curves) in zip(axes, lines.items(), strict=True):
+        ax.set_xlabel(text)
         ax.set_ylim(0.0, 1.02)
-        if not values.size:
-            continue
-        # A share of all runs: those without the number count as above any value.
-        share = np.arange(1, len(values) + 1) / data["outcome"].size
-        keep = draw.thin(len(values))
-        ax.step(values[keep], share[keep], where="post", color=draw.COLOURS[0])
-        _scale(ax, "x", values)
-    axes[0].set_ylabel("share of runs below")
-    return draw.finish(figure)
+        for k, (label, numbers) in enumerate(curves.items()):
+            values = np.sort(numbers)
+            # A share of all runs: those without the number count as above any value.
+            share = np.arange(1, len(values) + 1)[np.isfinite(values)] / total
+            values = values[np.isfinite(values)]
+            keep = draw.thin(len(values))
+            look = draw.pen(k, draw.NAMED)
+            ax.step(values[keep], share[keep], where="post", label=label, **look)
+        finite = np.concatenate([*curves.values()])
+        finite = finite[np.isfinite(finite)]
+        if finite.size:
+            _scale(ax, "x", finite)
+        if finite.size and finite.min() < 0.0:
+            ax.axvline(0.0, **draw.MARK)
+    axes[0].set_ylabel(f"share of {of} below")
+    return figure
 
 
 def _share(data: "xr.Dataset", keys: list[str]) -> "tuple[xr.DataArray, xr.DataArray]":
@@ -348,50 +369,21 @@ def seed_figures(comparison: SeedComparison) -> "dict[str, Figure]":
     """Return the figures of a comparison over seeds, by name.
 
     `quantiles` shows on which share of the seeds each method stays below a number, `differences`
-    on which share the number of a method less that of another does: left of 0 the first is better.
+    on which share the number of a method minus that of another does: left of 0 the first is better.
     """
+    rows, total = comparison.compared, len(comparison.seeds)
     names = [name for name in SUMMARIZED if name in comparison.names]
-    if not names:
-        return {}
-    rows = comparison.compared
-    single = {name: [(row.label, row.ranked(name)) for row in rows] for name in names}
     pairs = [*itertools.combinations(rows, 2)][: len(draw.COLOURS)]
-    double = {
-        name: [(f"{a.label} less {b.label}", differences(name, a, b)) for a, b in pairs]
-        for name in names
-    }
+    single, double = dict[str, _Lines](), dict[str, _Lines]()
+    for name in names:
+        text, unit = RUN_NUMBERS[name].label, comparison.unit(name)
+        single[draw.label(text, unit)] = {row.label: row.ranked(name) for row in rows}
+        double[draw.label(f"{text}, difference", unit)] = {
+            f"{a.label} minus {b.label}": differences(name, a, b) for a, b in pairs
+        }
+    lines = {"quantiles": single, "differences": double if pairs else {}}
     with draw.style():
-        drawings = {"quantiles": _shares(comparison, single, "")}
-        if pairs:
-            drawings["differences"] = _shares(comparison, double, ", difference")
-    return drawings
-
-
-def save_seed_figures(comparison: SeedComparison, folder: Path) -> None:
-    """Write each figure of a comparison over seeds as PNG and PDF under `folder`/figures.
-
-    Raises:
-        OSError: the folder or a file cannot be written.
-    """
-    save(seed_figures(comparison), folder / "figures")
-
-
-def _shares(
-    comparison: SeedComparison, curves: dict[str, list[tuple[str, Array]]], what: str
-) -> "Figure":
-    figure, (axes,) = draw.sheet(2.8, 1, len(curves))
-    for ax, (name, lines) in zip(axes, curves.items(), strict=True):
-        for k, (label, values) in enumerate(lines):
-            ordered, share = np.sort(values), np.arange(1, len(values) + 1) / len(comparison.seeds)
-            shown = np.isfinite(ordered)
-            look = draw.pen(k, draw.NAMED)
-            ax.step(ordered[shown], share[shown], where="post", label=label, **look)
-        text = RUN_NUMBERS[name].label + what
-        ax.set(ylim=(0.0, 1.02), xlabel=draw.label(text, comparison.unit(name)))
-        if what:
-            ax.axvline(0.0, **draw.MARK)
-    axes[0].set_ylabel("share of seeds below")
-    return draw.finish(figure)
+        return {x: draw.finish(_shares(some, total, "seeds")) for x, some in lines.items() if some}
 
 
 # ---- designs ----------------------------------------------------------------------------------

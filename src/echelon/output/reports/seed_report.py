@@ -1,83 +1,88 @@
 """The report of a comparison over seeds: outcomes, quantiles, and paired differences."""
 
-import io
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
 from echelon.core.types import JsonObject
 from echelon.core.words import amount
 from echelon.experiments.results.run_numbers import RUN_NUMBERS, settling_bound
-from echelon.experiments.studies.seed_comparison import (
-    LEVELS,
-    MethodSeeds,
-    PairedDifference,
-    SeedComparison,
-)
+from echelon.experiments.studies.seed_comparison import LEVELS, MethodSeeds, SeedComparison
 from echelon.output.reports.run_report import say
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.table import Table
 
 _PAIRED = 4
 """With more methods than this, only the differences to the last one are printed."""
-
-
-def seed_report(comparison: SeedComparison, width: int = 200) -> str:
-    """Return a comparison over seeds as plain text."""
-    from rich.console import Console
-
-    text = io.StringIO()
-    print_seeds(Console(file=text, width=width, color_system=None), comparison)
-    return text.getvalue().rstrip("\n")
 
 
 def print_seeds(console: "Console", comparison: SeedComparison) -> None:
     """Print a comparison over seeds on a rich console: three tables and remarks."""
     runs = f"{amount(len(comparison.seeds), 'seed')}, {comparison.horizon:.3g} s each"
     title = ", ".join([comparison.scenario, runs, *comparison.conditions])
-    within = settling_bound(comparison.length_unit)
-    table = _table(title, ("method", f"settled\nto {within}", "runs ended"))
-    for row in comparison.compared:
-        table.add_row(row.label, f"{row.settled} of {len(row.outcomes)}", _ended(row))
-    console.print(table)
+    settled = f"settled\nto {settling_bound(comparison.length_unit)}"
+    ended = [
+        (row.label, f"{row.settled} of {len(row.outcomes)}", _ended(row))
+        for row in comparison.compared
+    ]
+    _print(console, title, ("method", settled, "runs ended"), ended)
     levels = [f"{100 * level:.2g} %" for level in LEVELS]
-    table = _table("quantiles over the seeds", ("number", "method", *levels))
-    for name, row in itertools.product(comparison.names, comparison.compared):
-        cells = (_cell(name, value) for value in row.quantiles(name))
-        table.add_row(_head(comparison, name), row.label, *cells)
-    console.print(table)
-    _print_differences(console, comparison)
-    for row in comparison.rows:
-        if row.reason:
-            say(console, f"{row.label}: {row.reason}")
+    found = (
+        (_head(comparison, x), row.label, *(_cell(x, value) for value in row.quantiles(x)))
+        for x, row in itertools.product(comparison.names, comparison.compared)
+    )
+    _print(console, "quantiles over the seeds", ("number", "method", *levels), found)
+    heads = ("number", "difference", "median", "95 % interval", "first\nbetter", "second\nbetter")
+    _print(console, "differences on the same seed", heads, _differences(comparison))
+    for sentence in _notes(comparison):
+        say(console, sentence)
 
 
-def _print_differences(console: "Console", comparison: SeedComparison) -> None:
-    heads = ("number", "first less second", "median", "95 % interval", "first\nbetter on")
-    table = _table("paired differences", (*heads, "second\nbetter on"))
-    methods, few = comparison.compared, len(comparison.compared) <= _PAIRED
-    for pair in comparison.differences():
-        if few or methods[-1].label in (pair.first, pair.second):
-            cells = _difference(pair.median), _interval(pair), *map(str, pair.better)
-            who = f"{pair.first} less {pair.second}"
-            table.add_row(_head(comparison, pair.number), who, *cells)
+def _print(
+    console: "Console", title: str, columns: Iterable[str], rows: Iterable[Iterable[str]]
+) -> None:
+    from rich import box
+    from rich.table import Table
+
+    table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", pad_edge=False)
+    for column in columns:
+        words = column in ("number", "method", "difference", "runs ended")
+        table.add_column(column, justify="left" if words else "right", overflow="fold")
+    for row in rows:
+        table.add_row(*row)
     if table.rows:
         console.print(table)
-        for sentence in _notes(few):
-            say(console, sentence)
 
 
-def _notes(few: bool) -> Iterator[str]:
-    yield (
-        "All methods have the same starts, noise and messages on each seed. A run without a number, "
-        "as after it diverged, counts as worse than all others; `-` stands where too many runs have "
-        "none. Intervals of the median are by the sign test."
-    )
-    if not few:
-        yield "Differences to the last method are shown; `--json` has all."
+def _differences(comparison: SeedComparison) -> Iterator[tuple[str, ...]]:
+    methods = comparison.compared
+    for pair in comparison.differences():
+        if len(methods) <= _PAIRED or methods[-1].label in (pair.first, pair.second):
+            ends = [_signed(end) for end in pair.interval or [math.nan]]
+            interval = "-" if "-" in ends else " to ".join(ends)
+            who = f"{pair.first} minus {pair.second}"
+            numbers = _signed(pair.median), interval, *map(str, pair.better)
+            yield _head(comparison, pair.number), who, *numbers
+
+
+def _notes(comparison: SeedComparison) -> Iterator[str]:
+    methods = comparison.compared
+    if len(methods) > 1:
+        yield "On each seed all methods have the same starts, noise and lost messages."
+        yield "Intervals contain the median difference with 95 %, by the sign test."
+    if len(methods) > _PAIRED:
+        yield f"Only differences to {methods[-1].label} are shown; comparison.json has all."
+    if any(set(row.ended) - {"completed"} for row in methods):
+        yield "A run without a number, as after it diverged, counts as worse than all others."
+    if len(comparison.seeds) > 1 and methods and comparison.equal:
+        yield "All seeds give the same run: nothing in this scenario is random."
+    for row in comparison.rows:
+        done = len(row.outcomes)
+        short = f"{done} of {amount(len(comparison.seeds), 'run')} done; " * bool(done)
+        if row.reason:
+            yield f"{row.label}: {short if row not in methods else ''}{row.reason}"
 
 
 def _ended(row: MethodSeeds) -> str:
@@ -93,25 +98,8 @@ def _cell(name: str, value: float) -> str:
     return RUN_NUMBERS[name].cell(value if math.isfinite(value) else None, 3)
 
 
-def _difference(value: float) -> str:
-    return f"{value:+.3g}" if math.isfinite(value) else "-"
-
-
-def _interval(pair: PairedDifference) -> str:
-    if pair.interval is None or not all(map(math.isfinite, pair.interval)):
-        return "-"
-    return " to ".join(map(_difference, pair.interval))
-
-
-def _table(title: str, columns: tuple[str, ...]) -> "Table":
-    from rich import box
-    from rich.table import Table
-
-    table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", pad_edge=False)
-    for column in columns:
-        words = column in ("number", "method", "first less second", "runs ended")
-        table.add_column(column, justify="left" if words else "right", overflow="fold")
-    return table
+def _signed(value: float) -> str:
+    return "0" if value == 0.0 else f"{value:+.3g}" if math.isfinite(value) else "-"
 
 
 # ---- data ---------------------------------------------------------------------------------------
@@ -119,40 +107,34 @@ def _table(title: str, columns: tuple[str, ...]) -> "Table":
 
 def seed_mapping(comparison: SeedComparison) -> JsonObject:
     """Return a comparison over seeds ready for JSON; what is not finite is None."""
+    differences = []
+    for pair in comparison.differences():
+        interval = None if pair.interval is None else _finite(pair.interval)
+        plain = {"median": _finite([pair.median])[0], "interval": interval}
+        differences.append(pair._asdict() | plain | {"better": [*pair.better]})
     return {
         "scenario": comparison.scenario,
         "horizon_s": comparison.horizon,
-        "conditions": list(comparison.conditions),
-        "seeds": list(comparison.seeds),
+        "conditions": [*comparison.conditions],
+        "seeds": [*comparison.seeds],
+        "units": {name: comparison.unit(name) for name in comparison.names},
+        "levels": [*LEVELS],
         "methods": {row.label: _row_mapping(comparison, row) for row in comparison.rows},
-        "differences": [_pair_mapping(pair) for pair in comparison.differences()],
+        "differences": differences,
     }
 
 
 def _row_mapping(comparison: SeedComparison, row: MethodSeeds) -> JsonObject:
-    if not row.outcomes:
-        return {"reason": row.reason}
+    if row not in comparison.compared:
+        return {"outcomes": dict(row.ended), "reason": row.reason}
+    quantiles = {name: _finite(row.quantiles(name)) for name in comparison.names}
     return {
         "outcomes": dict(row.ended),
         "settled": row.settled,
-        "quantiles": {name: [*map(_finite, row.quantiles(name))] for name in comparison.names},
-        "reason": row.reason or None,
+        "quantiles": quantiles,
+        "reason": row.reason,
     }
 
 
-def _pair_mapping(pair: PairedDifference) -> JsonObject:
-    interval = None if pair.interval is None else [*map(_finite, pair.interval)]
-    return {
-        "number": pair.number,
-        "first": pair.first,
-        "second": pair.second,
-        "median": _finite(pair.median),
-        "interval_95": interval,
-        "first_better": pair.better[0],
-        "second_better": pair.better[1],
-        "seeds": pair.seeds,
-    }
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+def _finite(values: Iterable[float]) -> list[float | None]:
+    return [value if math.isfinite(value) else None for value in values]
