@@ -41,7 +41,7 @@ class MethodSeeds(NamedTuple):
     Attributes:
         label: of the method.
         outcomes: (K,) how each run ended, in one word; `refused` if it could not start.
-        numbers: (K,) by name; NaN where a run has none, as after it diverged.
+        numbers: (K,) by name; NaN where a run has none, as if it diverged.
         reason: why there are no runs, fewer than seeds, or refused ones; empty otherwise.
     """
 
@@ -189,7 +189,7 @@ def compare_seeds(
         only: as in `compare`; by default the laws, without methods that optimize.
         progress: as in `compare`; the runs before an interruption are kept.
 
-    A run that diverges or is refused has no errors, and counts as worse than all that have.
+    A run that diverges or is refused has no numbers, and counts as worse than all others.
 
     Raises:
         ScenarioError: a part cannot be built.
@@ -235,15 +235,18 @@ def _results(
     drive: DriveOf,
     part: Callable[[float], None],
 ) -> Iterator[Result | EchelonError]:
-    part(0.0)
+    done = 0
+
+    def report(_: int = 0, __: int = 0) -> None:
+        part(done)
+
+    report()
     runs, size = _runs(parts, scenes, drive), batch_size(parts, scenes[0][1])
-    for done in range(0, len(runs), size):
-        some = runs[done : done + size]
-
-        def report(step: int, of: int, done: int = done, count: int = len(some)) -> None:
-            part(done + count * step / of)
-
-        yield from batch.fly(some, report)
+    for first in range(0, len(runs), size):
+        for result in batch.fly(runs[first : first + size], report):
+            yield result
+            done += 1
+            report()
 
 
 def _runs(parts: Parts, scenes: Sequence[Run], drive: DriveOf) -> Sequence[Run]:
@@ -284,7 +287,8 @@ def _word(result: Result | EchelonError) -> str:
 
 
 def _numbers(result: Result | EchelonError) -> list[float]:
-    if isinstance(result, EchelonError):
+    # Of a run that diverged, distances until then would look like those of a whole run.
+    if isinstance(result, EchelonError) or not result.outcome.reached:
         return [np.nan] * len(NUMBERS)
     run = RunNumbers(result, metrics(result))
     found = (run.number(name) for name in NUMBERS)

@@ -14,14 +14,14 @@ from echelon.output.reports.run_report import say
 if TYPE_CHECKING:
     from rich.console import Console
 
-_PAIRED = 4
+_PAIRED = 3
 """With more methods than this, only the differences to the last one are printed."""
 
 
 def print_seeds(console: "Console", comparison: SeedComparison) -> None:
     """Print a comparison over seeds on a rich console: three tables and remarks."""
-    runs = f"{amount(len(comparison.seeds), 'seed')}, {comparison.horizon:.3g} s each"
-    title = ", ".join([comparison.scenario, runs, *comparison.conditions])
+    seeds = amount(len(comparison.seeds), "seed")
+    title = f"{comparison.scenario}, {seeds}, {comparison.horizon:.3g} s each"
     settled = f"settled\nto {settling_bound(comparison.length_unit)}"
     ended = [
         (row.label, f"{row.settled} of {len(row.outcomes)}", _ended(row))
@@ -69,20 +69,23 @@ def _differences(comparison: SeedComparison) -> Iterator[tuple[str, ...]]:
 
 def _notes(comparison: SeedComparison) -> Iterator[str]:
     methods = comparison.compared
+    yield from (f"Conditions: {text}." for text in comparison.conditions)
     if len(methods) > 1:
         yield "On each seed all methods have the same starts, noise and lost messages."
+    if len(methods) > 1 and len(comparison.seeds) > 5:
         yield "Intervals contain the median difference with 95 %, by the sign test."
     if len(methods) > _PAIRED:
         yield f"Only differences to {methods[-1].label} are shown; comparison.json has all."
     if any(set(row.ended) - {"completed"} for row in methods):
-        yield "A run without a number, as after it diverged, counts as worse than all others."
+        yield "A run without a number, as one that diverged, counts as worse than all others."
     if len(comparison.seeds) > 1 and methods and comparison.equal:
         yield "All seeds give the same run: nothing in this scenario is random."
     for row in comparison.rows:
-        done = len(row.outcomes)
-        short = f"{done} of {amount(len(comparison.seeds), 'run')} done; " * bool(done)
-        if row.reason:
-            yield f"{row.label}: {short if row not in methods else ''}{row.reason}"
+        if row.outcomes and row not in methods:
+            done = f"{len(row.outcomes)} of {amount(len(comparison.seeds), 'run')}"
+            yield f"{row.label}: interrupted after {done}, which seeds.csv contains."
+        elif row.reason:
+            yield f"{row.label}: {row.reason}"
 
 
 def _ended(row: MethodSeeds) -> str:
