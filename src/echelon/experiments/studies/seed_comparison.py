@@ -23,11 +23,11 @@ from echelon.experiments.studies.compare import (
     run_each,
     with_starts,
 )
-from echelon.experiments.sweeps.workers import FRAMES, batch_size
-from echelon.simulation.engine.batch import Batch, Run
+from echelon.simulation.engine.batch import FRAMES, Batch, Run, batch_size
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.result import Result
 from echelon.simulation.step.drive import Controller
+from echelon.simulation.step.settings import Settings
 
 LEVELS = (0.05, 0.5, 0.95)
 """The quantiles that are stated."""
@@ -43,12 +43,14 @@ class MethodSeeds(NamedTuple):
         outcomes: (K,) how each run ended, in one word; `refused` if it could not start.
         numbers: (K,) by name; NaN where a run has none, as if it diverged.
         reason: why there are no runs, fewer than seeds, or refused ones; empty otherwise.
+        unit: of the errors; empty without a position.
     """
 
     label: str
     outcomes: Sequence[str] = ()
     numbers: Mapping[str, Array] = {}
     reason: str = ""
+    unit: str = ""
 
     @property
     def settled(self) -> int:
@@ -100,7 +102,6 @@ class SeedComparison(NamedTuple):
         rows: one for each method.
         horizon: s, the same for all.
         conditions: wind and plant, in words.
-        length_unit: of the errors; empty without a position.
     """
 
     scenario: str
@@ -108,7 +109,11 @@ class SeedComparison(NamedTuple):
     rows: Sequence[MethodSeeds]
     horizon: float
     conditions: Sequence[str]
-    length_unit: str
+
+    @property
+    def length_unit(self) -> str:
+        """The unit of errors; empty without a position."""
+        return next((row.unit for row in self.rows if row.unit), "")
 
     @property
     def compared(self) -> list[MethodSeeds]:
@@ -177,7 +182,7 @@ def compare_seeds(
     scenario: ScenarioLike,
     seeds: Iterable[int],
     built: Experiment | None = None,
-    only: Sequence[str] | None = None,
+    only: Sequence[str] = known_labels(None, slow=False),
     progress: Callable[[str, float, int], None] = lambda label, done, methods: None,
 ) -> SeedComparison:
     """Run each method on a scenario with the same seeds: the same starts, noise and messages.
@@ -196,36 +201,31 @@ def compare_seeds(
         LawError: no seed is given, one twice, or too many for the memory.
     """
     scenario, seeds = as_scenario(scenario), tuple(map(int, seeds))
-    only = known_labels(None, slow=False) if only is None else only
-    _check(seeds, len(only))
     parts, settings = build(scenario) if built is None else built
-    settings = settings._replace(store_every=-(-settings.steps // FRAMES))
-    drawn = [settings._replace(seed=seed) for seed in seeds]
-    scenes = [*zip(with_starts(parts, seeds), drawn, strict=True)]
-    rows, batch, units = list[MethodSeeds](), Batch(), [""]
+    scenes, rows, batch = _scenes(parts, settings, seeds, len(only)), list[MethodSeeds](), Batch()
 
     def fly(label: str, drive: DriveOf) -> Controller | None:
         def part(done: float) -> None:
             progress(label, len(rows) + done / len(seeds), len(only))
 
-        row, first = _row(label, _results(batch, parts, scenes, drive, part))
+        row, flown = _row(label, _results(batch, parts, scenes, drive, part))
         rows.append(row)
-        if first is None:
-            return None
-        units.append(first.length_unit)
-        return first.drive
+        return flown
 
     run_each(scenario, parts, only, fly)
-    about = settings.horizon, conditions_of(parts), units[-1]
-    return SeedComparison(scenario.name, seeds, rows, *about)
+    return SeedComparison(scenario.name, seeds, rows, settings.horizon, conditions_of(parts))
 
 
-def _check(seeds: Sequence[int], methods: int) -> None:
+def _scenes(parts: Parts, settings: Settings, seeds: Sequence[int], methods: int) -> list[Run]:
+    """Return what the methods have in common on each seed."""
     if not seeds or len({*seeds}) < len(seeds) or min(seeds) < 0:
         raise LawError("`seeds` must be one or more different whole numbers from 0 on.")
     excess = excess_runs(len(seeds) * methods)
     if excess is not None:
         raise LawError(f"`seeds`: {excess}.")
+    settings = settings._replace(store_every=-(-settings.steps // FRAMES))
+    drawn = (settings._replace(seed=seed) for seed in seeds)
+    return [*zip(with_starts(parts, seeds), drawn, strict=True)]
 
 
 def _results(
@@ -260,8 +260,10 @@ def _runs(parts: Parts, scenes: Sequence[Run], drive: DriveOf) -> Sequence[Run]:
     return [(own.replace(drive=drive(own, settings)), settings) for own, settings in scenes]
 
 
-def _row(label: str, results: Iterator[Result | EchelonError]) -> tuple[MethodSeeds, Result | None]:
-    """Return the runs of a method, and the first that was not refused."""
+def _row(
+    label: str, results: Iterator[Result | EchelonError]
+) -> tuple[MethodSeeds, Controller | None]:
+    """Return the runs of a method, and the drive of the first that was not refused."""
     outcomes, numbers, reason, first = list[str](), list[list[float]](), "", None
     try:
         for result in results:
@@ -279,7 +281,7 @@ def _row(label: str, results: Iterator[Result | EchelonError]) -> tuple[MethodSe
     if first is None:
         return MethodSeeds(label, reason=reason), None
     columns = dict(zip(NUMBERS, np.array(numbers).T, strict=True))
-    return MethodSeeds(label, outcomes, columns, reason), first
+    return MethodSeeds(label, outcomes, columns, reason, first.length_unit), first.drive
 
 
 def _word(result: Result | EchelonError) -> str:

@@ -10,28 +10,8 @@ from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.sweeps.plan import Sweep, SweepRun
 from echelon.experiments.sweeps.sweep_dataset import SweepBatch, columns_of, numbers_of, refused
 from echelon.guarantees.promises.promise import Guarantee, promises
-from echelon.simulation.engine.batch import Batch, StepCount
-from echelon.simulation.engine.parts import Parts
+from echelon.simulation.engine.batch import FRAMES, Batch, StepCount, batch_size
 from echelon.simulation.engine.result import Result
-from echelon.simulation.native import is_installed
-from echelon.simulation.step.settings import Settings
-
-_AGENT_STEPS, _MOST, _LEAST = 20_000_000, 2_500, 16
-"""Size of a batch: one or two seconds of native code, and at least one run for each vector lane."""
-_SLOWER = 20
-"""Factor by which JAX is slower than native code."""
-_NUMBERS = 32 * 2**20
-"""Most numbers of the frames in a batch, where frames are stored."""
-FRAMES = 20
-"""Frames of a run checked for numbers that are not finite or exceed native code's range."""
-
-
-def batch_size(parts: Parts, settings: Settings, stored: int | None = None) -> int:
-    """Return how many runs to step together; `stored` is how many numbers each run stores."""
-    fast = settings.engine != "jax" and is_installed()
-    most, least = (_AGENT_STEPS, _LEAST) if fast else (_AGENT_STEPS // _SLOWER, 1)
-    most = min(_MOST, most // (settings.steps * parts.graph.agents), _NUMBERS // (stored or 1))
-    return max(least if stored is None else 1, most)
 
 
 @final
