@@ -209,7 +209,8 @@ def compare(
     changes = [f"simulation.horizon={horizon!r}", *(set_ or [])]
     loaded = [load_scenario(name, changes) for name in scenarios]
     names = ", ".join(scenario.name for scenario in loaded)
-    STATUS.begin(f"comparing methods on {names}, which takes minutes", not as_json)
+    minutes = ", which takes minutes" * (seeds is None)
+    STATUS.begin(f"comparing methods on {names}{minutes}", not as_json)
     from echelon.experiments.scenario.build import build
     from echelon.experiments.studies.compare import known_labels, laws_of
     from echelon.output.archive.folder import claim_folders

@@ -243,14 +243,14 @@ def _distributions(data: "xr.Dataset") -> "Figure":
     for name in SUMMARIZED:
         text = draw.label(RUN_NUMBERS[name].label, data[name].attrs.get("units", ""))
         lines[text] = {"": data[name].values.ravel()}
-    return draw.finish(_shares(lines, data["outcome"].size, "runs"))
+    return _shares(lines, data["outcome"].size, "runs")
 
 
 _Lines = dict[str, Array]
 """Numbers of runs by the label of their line; those that are not finite exceed all others."""
 
 
-def _shares(lines: dict[str, _Lines], total: int, of: str) -> "Figure":
+def _shares(lines: dict[str, _Lines], total: int, of: str, signed: bool = False) -> "Figure":
     """Return on which share of `total` runs a number stays below each value, by its name."""
     figure, (axes,) = draw.sheet(2.8, 1, len(lines))
     for ax, (text, curves) in zip(axes, lines.items(), strict=True):
@@ -266,12 +266,12 @@ def _shares(lines: dict[str, _Lines], total: int, of: str) -> "Figure":
             ax.step(values[keep], share[keep], where="post", label=label, **look)
         finite = np.concatenate([*curves.values()])
         finite = finite[np.isfinite(finite)]
-        if finite.size:
-            _scale(ax, "x", finite)
-        if finite.size and finite.min() < 0.0:
+        if signed:
             ax.axvline(0.0, **draw.MARK)
+        elif finite.size:
+            _scale(ax, "x", finite)
     axes[0].set_ylabel(f"share of {of} below")
-    return figure
+    return draw.finish(figure)
 
 
 def _share(data: "xr.Dataset", keys: list[str]) -> "tuple[xr.DataArray, xr.DataArray]":
@@ -381,9 +381,11 @@ def seed_figures(comparison: SeedComparison) -> "dict[str, Figure]":
         double[draw.label(f"{text}, difference", unit)] = {
             f"{a.label} minus {b.label}": differences(name, a, b) for a, b in pairs
         }
-    lines = {"quantiles": single, "differences": double if pairs else {}}
     with draw.style():
-        return {x: draw.finish(_shares(some, total, "seeds")) for x, some in lines.items() if some}
+        figures = {"quantiles": _shares(single, total, "seeds")} if names else {}
+        if names and pairs:
+            figures["differences"] = _shares(double, total, "seeds", signed=True)
+    return figures
 
 
 # ---- designs ----------------------------------------------------------------------------------
