@@ -224,6 +224,11 @@ def _equilibrated(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return matrix, rows
 
 
+def equilibrated_rank(matrix: np.ndarray) -> int:
+    """Return the rank of a matrix in any units: singular values above 1e-9 of the scaled one."""
+    return int((np.linalg.svd(_equilibrated(matrix)[0], compute_uv=False) > 1e-9).sum())
+
+
 def observability_rank(A: np.ndarray, C: np.ndarray) -> int:
     """Return the rank of the observability matrix [C; C A; ...], each block scaled to size 1."""
     block, rows = C, [C]
