@@ -146,13 +146,17 @@ def longest_step(
     grows, and that last tenth is bisected; infinite where none grows up to a thousand times the
     slowest mode's. Shapes are those of `sampled_radius`.
     """
-    poles = np.linalg.eigvals(A - B @ gains)
-    # A mode on the imaginary axis has no slowest time; 1e-9 1/s keeps the search finite.
-    dt, end = 1e-3 / np.abs(poles).max(), 1e3 / max(1e-9, float(np.abs(poles.real).min()))
 
     def decays(dt: float) -> bool:
         return sampled_radius(A, B, gains, dt, integrator, substeps) < 1.0
 
+    return longest_decay(decays, np.linalg.eigvals(A - B @ gains))
+
+
+def longest_decay(decays: Callable[[float], bool], poles: np.ndarray) -> float:
+    """Return the longest step (s) with which loops decay, searched as `longest_step` does."""
+    # A mode on the imaginary axis has no slowest time; 1e-9 1/s keeps the search finite.
+    dt, end = 1e-3 / np.abs(poles).max(), 1e3 / max(1e-9, float(np.abs(poles.real).min()))
     while decays(1.1 * dt):
         dt *= 1.1
         if dt > end:

@@ -28,6 +28,7 @@ from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.values import (
     Agent,
     Agents,
+    Allowed,
     ClassInFile,
     Count,
     Edges,
@@ -379,7 +380,10 @@ _STOPPING = TakenBy("stopping-point")
 _Roots = Annotated[tuple[Positive, ...] | None, Field(strict=False), Unit("1/s"), _STOPPING]
 _Rate = Annotated[Positive | None, Unit("1/s"), _STOPPING]
 _Speed = Annotated[Speed | None, Unit("the outputs' per s"), _STOPPING]
-_Weights = bool | NotNegative | Annotated[tuple[NotNegative, ...], Field(strict=False)] | None
+_Weights = Annotated[
+    bool | NotNegative | Annotated[tuple[NotNegative, ...], Field(strict=False)],
+    Allowed("is `true`, a number of at least 0, or a list of such numbers"),
+]
 _PER_SUM = Unit("1 over the outputs' squared, per s^2")
 
 
@@ -434,7 +438,7 @@ class LeaderSpec(Section):
     gain: Annotated[GainSpec | None, TakenBy("tracking", "optimal-tracking")] = None
     """Gain of the leader's tracking, under `tracking` and `optimal-tracking`; default the model's
     Riccati gain."""
-    integral: Annotated[_Weights, _PER_SUM, TakenBy("tracking")] = None
+    integral: Annotated[_Weights | None, _PER_SUM, TakenBy("tracking")] = None
     """Whether the leader sums the errors of its position and its heading, which removes those of
     constant pushes: `true`, or the weights of the sums, one for all or one for each."""
 
@@ -484,7 +488,7 @@ class FollowerSpec(Section):
     frame: Annotated[str, OneOf(map(str, Frame)), TakenBy("consensus")] = str(Frame.HEADING)
     """Axes of the gain, under `consensus`: `heading`, they turn with the leader's desired heading,
     if the model has one; `world`, they are fixed, as in the paper."""
-    integral: Annotated[_Weights, _PER_SUM, TakenBy("consensus")] = None
+    integral: Annotated[_Weights | None, _PER_SUM, TakenBy("consensus")] = None
     """Whether followers sum the errors of positions and heading, which removes those of constant
     pushes: `true`, or the weights of the sums, one for all or one for each."""
     trim: Annotated[bool, TakenBy("consensus")] = True

@@ -12,6 +12,7 @@ from echelon.agents.models.heading_symmetry import (
     heading_of,
     state_turn,
 )
+from echelon.agents.models.linearization import Linearization
 from echelon.agents.models.model import ControlAffine
 from echelon.core.compiled import cached_jit
 from echelon.core.digits import about, at_least, at_most
@@ -23,10 +24,9 @@ from echelon.core.words import Kind, Theorem, amount
 from echelon.guarantees.local.local_certificate import LocalCertificate
 from echelon.guarantees.local.local_lines import local_lines
 from echelon.guarantees.promises.case import GuaranteeInputs
-from echelon.laws.law import gain_of
+from echelon.guarantees.promises.integral_modes import slowest_in_axes
 from echelon.simulation.engine.law_drive import Laws
 from echelon.synthesis.certificates.margins import detectability
-from echelon.synthesis.gains.gain import Gain
 
 # ---- a law whose gain turns with the heading -----------------------------------------------------
 # Where f and g turn with the heading, the guarantee for errors at the trim holds at any constant
@@ -92,18 +92,13 @@ def slowest_in_turns(case: GuaranteeInputs) -> dict[float, float]:
 
 def slowest_in_turn(case: GuaranteeInputs, rate: float) -> float | None:
     """Return the slowest mode in a steady turn (rad/s) about the trim, 1/s; None without a turn."""
-    model, loop, gain = case.parts.model, case.loop, case.parts.drive.gain
-    assert isinstance(case.parts.drive, Laws) and isinstance(gain, Gain)
+    model = case.parts.model
     there = steady_turn(model, rate)
     if there is None:
         return None
     A, B = (np.asarray(part) for part in _slopes(model, *map(jnp.asarray, there)))
     A = A - rate * state_turn(model).slope
-    K = gain.R_inverse @ B.T @ gain.P
-    gains = [loop.inner + strength * K for strength in loop.closed.strengths]
-    own = gain_of(case.parts.drive.leader)
-    gains += [] if own is None else [own.coupling * own.R_inverse @ B.T @ own.P]
-    return float(np.linalg.eigvals(A - B @ np.array(gains)).real.max())
+    return slowest_in_axes(case.parts, case.loop, Linearization(A, B), rate)
 
 
 def steady_turn(model: ControlAffine, rate: float) -> tuple[Array, Array] | None:

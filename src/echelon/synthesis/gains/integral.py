@@ -1,9 +1,9 @@
 """Integral action of a law: the sums of its outputs' errors are states of its Riccati equation.
 
-With s' = C z, where C picks the outputs, the pair (z, s) obeys the augmented matrices A_a = [[A, 0],
-[C, 0]] and B_a = [B; 0]. P_a solves their Riccati equation, and u = -c R^-1 B_a'P_a (z, s) has the
-modes A_a - c lambda B_a R^-1 B_a'P_a, which decay for 2 c lambda_min >= 1 as those without a sum
-do. With P_a = [[P, N], [N', M]] the law is u = -c R^-1 B'P (z + L s), L = P^-1 N: that of a gain P.
+With s' = C z, where C picks the outputs, (z, s) obeys A_a = [[A, 0], [C, 0]] and B_a = [B; 0].
+P_a solves their Riccati equation, and u = -c R^-1 B_a'P_a (z, s) has the modes A_a - c lambda B_a
+R^-1 B_a'P_a, which decay for 2 c lambda_min >= 1 as those without a sum do. With P_a = [[P, N],
+[N', M]] the law is u = -c R^-1 B'P (z + L s), L = P^-1 N: that of a gain P.
 """
 
 from collections.abc import Sequence
@@ -189,7 +189,7 @@ def _solved(
     linear = linearize(model).with_inner(inner)
     outputs, given = _outputs(model, linear, weights)
     A, B = augmented(linear, outputs)
-    Q = _implied_weight(model, linear, P, R)
+    Q = _implied_weight(linear, P, R)
     if given is not None:
         return _split(outputs, given, riccati(A, B, scipy.linalg.block_diag(Q, np.diag(given)), R))
     plain = _slowest(linear, P, R, strengths)
@@ -277,13 +277,13 @@ def _check_turns(model: ControlAffine, outputs: Sequence[int]) -> None:
         )
 
 
-def _implied_weight(model: ControlAffine, linear: Linearization, P: Array, R: Array) -> Array:
+def _implied_weight(linear: Linearization, P: Array, R: Array) -> Array:
     """Return Q (n, n) for which P solves the Riccati equation: the weight of a gain by `riccati`.
 
     Raises:
         GainError: it is not positive semidefinite.
     """
-    (A, B), push = linear, linear.B @ np.linalg.solve(R, linear.B.T)
+    A, push = linear.A, linear.B @ np.linalg.solve(R, linear.B.T)
     Q = P @ push @ P - A.T @ P - P @ A
     size = abs(P) @ abs(push) @ abs(P) + abs(A.T) @ abs(P) + abs(P) @ abs(A)
     Q = symmetric_part(np.where(abs(Q) > _ROUNDING * size, Q, 0.0))
