@@ -188,21 +188,18 @@ def _solved(
     P, R, inner = gain
     linear = linearize(model).with_inner(inner)
     outputs, given = _outputs(model, linear, weights)
-    A, B = augmented(linear, outputs)
-    Q = _implied_weight(linear, P, R)
-    if given is not None:
-        return _split(outputs, given, riccati(A, B, scipy.linalg.block_diag(Q, np.diag(given)), R))
-    plain = _slowest(linear, P, R, strengths)
-    sizes = np.diag(Q)[list(outputs)]
-    sizes = np.where(sizes > 0.0, sizes, 1.0)
-    lost, found = np.inf, None
-    for factor in _TRIED:
-        used = tuple((factor * sizes).round(12).tolist())
-        whole = riccati(A, B, scipy.linalg.block_diag(Q, np.diag(used)), R)
-        loss = 1.0 - _slowest(Linearization(A, B), whole, R, strengths) / plain
-        if loss < lost:
-            lost, found = loss, _split(outputs, used, whole)
-        if loss <= _LOST:
+    _check_outputs(model, linear, outputs)
+    whole, Q = augmented(linear, outputs), _implied_weight(linear, P, R)
+    enough = (1.0 - _LOST) * _slowest(linear, P, R, strengths)
+    # Six digits, so that rounding of Q changes no weight.
+    sizes = [[float(f"{x * (Q[k, k] or 1.0):.6g}") for k in outputs] for x in _TRIED]
+    least, found = np.inf, None
+    for used in sizes if given is None else [given]:
+        P = riccati(*whole, np.asarray(scipy.linalg.block_diag(Q, np.diag(used))), R)
+        slowest = _slowest(whole, P, R, strengths)
+        if found is None or slowest < least:
+            least, found = slowest, _split(outputs, (*used,), P)
+        if slowest <= enough:
             break
     assert found is not None
     return found
@@ -225,56 +222,46 @@ def _outputs(
     model: ControlAffine, linear: Linearization, weights: tuple[float, ...] | None
 ) -> tuple[tuple[int, ...], tuple[float, ...] | None]:
     """Return the states that are summed, and their weights if the user gave some."""
-    name, m = f"`{type(model).__name__}`", len(model.input_names)
-    every = summed_states(model)
-    if not every:
-        raise GainError(f"`integral` sums positions and headings, and {name} has none.")
+    every, place = summed_states(model), model.position_indices()
     if weights is None:
         # Of a vehicle whose inputs cannot hold its heading too, its position alone.
-        both, place = every, model.position_indices()
-        outputs = both if _held(linear, both) or not place else place
-    else:
-        full = weights * len(every) if len(weights) == 1 else weights
-        if len(full) != len(every):
-            names = listing(model.state_names[k] for k in every)
-            raise GainError(
-                f"`integral` has {amount(len(full), 'weight')}, and {name} needs one for all, or "
-                f"one for each of {names}."
-            )
-        outputs = tuple(k for k, weight in zip(every, full, strict=True) if weight)
-        weights = tuple(weight for weight in full if weight)
+        return (every if _held(linear, every) or not place else place), None
+    full = weights * len(every) if len(weights) == 1 else weights
+    if len(full) != len(every):
+        names = listing(model.state_names[k] for k in every)
+        raise GainError(
+            f"`integral` has {amount(len(full), 'weight')}, and `{type(model).__name__}` needs one "
+            f"for all, or one for each of {names}."
+        )
+    outputs = tuple(k for k, weight in zip(every, full, strict=True) if weight)
+    return outputs, tuple(weight for weight in full if weight)
+
+
+def _check_outputs(model: ControlAffine, linear: Linearization, outputs: tuple[int, ...]) -> None:
+    """Check that constant inputs hold outputs, and that the heading turns them into each other."""
+    name, m = f"`{type(model).__name__}`", len(model.input_names)
     names = listing(model.state_names[k] for k in outputs)
-    if len(outputs) > m:
-        raise GainError(
-            f"`integral` sums {names} of {name}, and {amount(m, 'input')} can hold no more than "
-            f"{amount(m, 'output')} without an error; give weights 0 to the others."
-        )
-    if not _held(linear, outputs):
-        raise GainError(
-            f"`integral` sums {names} of {name}, whose inputs cannot hold all of them at once "
-            "([[A, B], [C, 0]] has no full rank); give weights 0 to some."
-        )
-    _check_turns(model, outputs)
-    return outputs, weights
+    alone = [k for k in outputs if state_turn(model).partners[k] not in outputs]
+    text = ""
+    if not outputs:
+        text = f"positions and headings, and {name} has none"
+    elif len(outputs) > m:
+        text = f"{names} of {name}, and its inputs can hold {m} at most; give the others weight 0"
+    elif not _held(linear, outputs):
+        text = f"{names} of {name}, whose inputs cannot hold them all ([[A, B], [C, 0]] has not "
+        text += "full rank); give some of them weight 0"
+    elif alone:
+        pair = (alone[0], state_turn(model).partners[alone[0]])
+        text = f"one of {listing(model.state_names[k] for k in pair)}, which turn into each other "
+        text += "with the heading; give both a weight, or none"
+    if text:
+        raise GainError(f"`integral` sums {text}.")
 
 
 def _held(linear: Linearization, outputs: Sequence[int]) -> bool:
     """Tell whether [[A, B], [C, 0]] has rank n + q: constant inputs hold any outputs."""
     whole = np.hstack(augmented(linear, outputs))
     return len(outputs) <= linear.B.shape[1] and equilibrated_rank(whole) == len(whole)
-
-
-def _check_turns(model: ControlAffine, outputs: Sequence[int]) -> None:
-    """Check that outputs that turn into each other with the heading are all summed, or none."""
-    partners = state_turn(model).partners
-    alone = [k for k in outputs if partners[k] not in outputs]
-    if alone:
-        k = alone[0]
-        names = listing(model.state_names[j] for j in (k, partners[k]))
-        raise GainError(
-            f"`integral` sums one of {names}, which turn into each other with the heading; give "
-            "both a weight, or none."
-        )
 
 
 def _implied_weight(linear: Linearization, P: Array, R: Array) -> Array:
@@ -286,7 +273,7 @@ def _implied_weight(linear: Linearization, P: Array, R: Array) -> Array:
     A, push = linear.A, linear.B @ np.linalg.solve(R, linear.B.T)
     Q = P @ push @ P - A.T @ P - P @ A
     size = abs(P) @ abs(push) @ abs(P) + abs(A.T) @ abs(P) + abs(P) @ abs(A)
-    Q = symmetric_part(np.where(abs(Q) > _ROUNDING * size, Q, 0.0))
+    Q: Array = symmetric_part(np.where(abs(Q) > _ROUNDING * size, Q, 0.0))
     values, vectors = np.linalg.eigh(Q)
     if values.min() < -_ROUNDING * size.max():
         raise GainError(
