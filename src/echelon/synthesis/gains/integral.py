@@ -193,16 +193,13 @@ def _solved(
     enough = (1.0 - _LOST) * _slowest(linear, P, R, strengths)
     # Six digits, so that rounding of Q changes no weight.
     sizes = [[float(f"{x * (Q[k, k] or 1.0):.6g}") for k in outputs] for x in _TRIED]
-    least, found = np.inf, None
+    tried = list[tuple[float, _Solution]]()
     for used in sizes if given is None else [given]:
         P = riccati(*whole, np.asarray(scipy.linalg.block_diag(Q, np.diag(used))), R)
-        slowest = _slowest(whole, P, R, strengths)
-        if found is None or slowest < least:
-            least, found = slowest, _split(outputs, (*used,), P)
-        if slowest <= enough:
+        tried.append((_slowest(whole, P, R, strengths), _split(outputs, (*used,), P)))
+        if tried[-1][0] <= enough:
             break
-    assert found is not None
-    return found
+    return min(tried, key=lambda one: one[0])[1]
 
 
 def _slowest(linear: Linearization, P: Array, R: Array, strengths: Array) -> float:
