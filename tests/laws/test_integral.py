@@ -23,6 +23,7 @@ from echelon.simulation.onboard.agent_functions import agent_functions
 
 SQUARE = ech.Graph.from_edges([(0, 1), (0, 2), (1, 3), (2, 3)])
 PLANAR = ech.models.PlanarQuadrotor()
+VEHICLES = PLANAR, ech.models.Quadrotor.crazyflie()
 LINE = ech.references.Line(velocity=(0.5, 0.2, 0.0))
 STEPS = ech.Settings(horizon=2.0, dt=0.005)
 
@@ -73,7 +74,7 @@ def own_rate(model, graph, weights, coupling, dt):
     one = np.eye(len(L))
     top = np.kron(one, F) - np.kron(L, G @ K[:, :n]), -np.kron(one, G @ K[:, n:])
     step = np.block([[*top], [np.kron(L, dt * C), np.eye(len(L) * len(C))]])
-    return np.log(np.abs(np.linalg.eigvals(step)).max()) / dt
+    return float(np.log(np.abs(np.linalg.eigvals(step)).max()) / dt)
 
 
 # ---- gains and modes -----------------------------------------------------------------------------
@@ -125,7 +126,7 @@ def test_the_guarantee_is_that_of_the_whole_matrix(weight, factor, dt, directed)
     law = follower(model, weight, graph, coupling)
     stated = guarantee(parts_of(model, ech.laws.TrimInput(), law, graph), STEPS._replace(dt=dt))
     rate = own_rate(model, graph, [weight], coupling, dt)
-    assert stated.claimed is (rate < 0.0)
+    assert stated.claimed == (rate < 0.0)
     assert stated.slowest == pytest.approx(rate, rel=1e-6, abs=1e-8)
 
 
@@ -181,8 +182,8 @@ def test_a_constant_wind_leaves_less_than_a_millimetre(sums):
     wind = ech.World(disturbance=ech.Disturbance(constant={"vy": 0.3}))
     leads = ech.laws.Tracking(LINE, integral=sums)
     errors = ends(parts_of(PLANAR, leads, follower(PLANAR, sums), world=wind))
-    assert (errors.max() < 1e-4) is (sums is True)
-    assert errors.max() < 0.2
+    # Without sums the leader is 113 mm off its path.
+    assert errors.max() < 1e-4 if sums else 0.11 < errors.max() < 0.12
 
 
 @pytest.mark.parametrize("path", [LINE, ech.references.Circle(radius=1.0, rate=0.6)])
@@ -224,7 +225,7 @@ def test_a_limit_that_acts_for_long_does_not_wind_up_the_sums(start):
 def test_without_the_key_no_bit_changes_and_the_law_has_its_gain():
     law, none = follower(PLANAR, None), follower(PLANAR, False)
     assert law.integral is none.integral is None and law.init() is None
-    assert gain_of(law) is gain_for(PLANAR) and gain_of(follower(PLANAR, True)) is None
+    assert gain_of(law) is law.gain and gain_of(follower(PLANAR, True)) is None
 
 
 @pytest.mark.parametrize(
@@ -256,7 +257,7 @@ def test_at_another_heading_the_sums_act_as_at_the_trim():
         turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
         push = dict(zip(("vx", "vy"), (turn @ [wind, 0.0]).tolist(), strict=True))
         world = ech.World(disturbance=ech.Disturbance(constant=push))
-        path = ech.references.Waypoints(((0.0, 0, 0, 0, angle), (3.0, 0, 0, 0, angle)))
+        path = ech.references.Hover(position=(0.0, 0.0, 0.0), yaw=angle)
         law = follower(model, True, graph, feedforward="none")
         offsets = ech.Formation.from_offsets(model, graph, {})
         drive = ech.Laws(ech.laws.Tracking(path, integral=True), law)
@@ -287,7 +288,7 @@ def test_check_and_design_state_what_sums_cost():
 class Stubborn(ech.models.DoubleIntegrator):
     """A point of which the force moves both coordinates alike, but the second twice as much."""
 
-    input_names = ("force",)
+    input_names, input_units = ("force",), ("m/s^2",)
 
     def input_map(self, x):
         return super().input_map(x) @ np.array([[1.0], [2.0]])
@@ -303,7 +304,7 @@ REACTS = ech.laws.Tracking(LINE, reaction=gain_for(POINT), integral=True)
         (lambda: follower(POINT, -1.0), "weights that are not negative"),
         (lambda: follower(POINT, (1.0, np.inf, 1.0)), "weights that are not negative"),
         (lambda: follower(POINT, 0.0), "at least one above 0"),
-        (lambda: parts_of(POINT, ech.laws.TrimInput(), follower(POINT, (1.0, 1.0))), "2 weights"),
+        (lambda: parts_of(POINT, ech.laws.TrimInput(), follower(POINT, (1.0,) * 3)), "3 weights"),
         (lambda: parts_of(POINT, REACTS, follower(POINT, True)), "reacts to its neighbours"),
         (
             lambda: parts_of(POINT, follower(POINT, None), follower(POINT, True)),
@@ -326,7 +327,7 @@ def test_what_cannot_be_summed_is_refused_before_the_run(make, message):
         (ech.models.Pendulum(), None, True, "positions and headings, and `Pendulum` has none"),
         (Stubborn(dimension=2), np.eye(4), True, "its inputs can hold 1 at most"),
         (ech.models.Quadrotor.crazyflie(), None, (1.0, 0.0, 1.0, 1.0), "one of `x`, `y`"),
-        (POINT, -np.ones(6) + 2.0, True, "needs a gain whose P satisfies"),
+        (POINT, np.ones(4), True, "needs a gain whose P satisfies"),
     ],
 )
 def test_outputs_that_inputs_cannot_hold_are_refused(model, gain, weights, message):
