@@ -126,7 +126,7 @@ class Places(abc.ABC):
 
     @abc.abstractmethod
     def of_edges(self, values: Array) -> Array:
-        """Return values (E,) of edges where their sums are, as far as NumPy does not repeat them."""
+        """Return values (E,) of edges where their sums are, unless NumPy repeats them."""
 
     @abc.abstractmethod
     def spacing(self, edges: Array) -> Array:

@@ -333,7 +333,7 @@ class NativeStepper(Stepper):
             self.neighbourhood = self.neighbourhood._replace(leaders=leaders)
             self._pairs.among(here)
             ends = here[np.asarray(self.loop.meter.edges)]
-            self._unmeasured = self.places.of_edges(~ends.all(axis=1))
+            self._unmeasured = self.places.of_edges(np.asarray(~ends.all(axis=1)))
         return constant
 
     def _new(self, step: int) -> Array | None:
