@@ -250,16 +250,14 @@ def _step(radio: Radio, axes: PyTree, place: jax.Array, row: jax.Array) -> _Step
         led = now.mail.packet.leader == jnp.arange(len(place))
         now, decided = deliver(radio, now, step)
         letter = decided.slot.astype(jnp.int32) * row + place[senders]
-        by = decided.place.astype(jnp.int32)
-        packet = jnp.where(by >= 0, letter[by], -1)
+        packet = jnp.where(decided.place >= 0, letter[decided.place.astype(jnp.int32)], -1)
         leads = jnp.where(decided.leads, 2 - led, 0).astype(jnp.int32)[: len(place) * changes]
         return now, (jnp.where(decided.new, letter, -1), packet, leads)
 
     def all_(now: Empty, step: jax.Array) -> tuple[Empty, _Decided]:
         count, sizes = len(now.mail.stamp), (len(senders), len(place), len(place) * changes)
         nothing = tuple(jnp.full((count, k), -1, jnp.int32) for k in sizes)
-        # Where nothing arrives and nothing is sent, time alone changes nothing, as long as nobody
-        # takes the lead.
+        # Where nothing arrives or is sent, and nobody takes the lead, time changes nothing.
         busy = step % jnp.max(jnp.asarray(medium.every)) == 0
         busy |= (now.in_flight.arrival == step).any() | changes
         many = jax.vmap(one, (axes, 0, None))
