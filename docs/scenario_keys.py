@@ -4,6 +4,7 @@ Run it with `python docs/scenario_keys.py`.
 """
 
 import inspect
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -22,37 +23,65 @@ units and angles in rad; *1* marks a number without a unit. `python: file.py:Cla
 """
 Schema: TypeAlias = Mapping[str, Any]
 """A part of a JSON schema."""
-_COLUMNS = ("key", "what", "unit", "default", "meaning")
+_NAMES = {"ModelSpec": "Models", "ReferenceSpec": "References"}
+"""Sections whose names have a table of their own."""
 
 
 def keys_page() -> str:
     """Return the page in Markdown."""
     schema = json_schema()
-    parts = [_HEAD, *_section("the file", schema, schema["$defs"])]
-    for name, what in schema["properties"].items():
-        inner = _referred(what, schema["$defs"])
-        if inner is not None:
-            parts += _section(f"`{name}`", inner, schema["$defs"])
-    title, defs = "an entry of `motion`, of the formation", schema["$defs"]
-    parts += _section(title, defs["MotionSpec"], defs)
-    parts += _section("`gain`, of leader or follower", schema["$defs"]["GainSpec"], schema["$defs"])
+    defs = schema["$defs"]
+    inner = {name: _referred(what, defs) for name, what in schema["properties"].items()}
+    sections = {"the file": schema} | {f"`{x}`": part for x, part in inner.items() if part}
+    sections["an entry of `motion`, of the formation"] = defs["MotionSpec"]
+    sections["`gain`, of leader or follower"] = defs["GainSpec"]
+    parts, explained = [_HEAD], dict[tuple[str, str], str]()
+    for title, part in sections.items():
+        parts += _section(title, part, defs, explained)
     parts += [*_named("References", registry.REFERENCES), *_named("Models", registry.MODELS)]
     return "\n".join(parts)
 
 
-def _section(title: str, part: Schema, defs: Schema) -> Iterator[str]:
+def _section(
+    title: str, part: Schema, defs: Schema, explained: dict[tuple[str, str], str]
+) -> Iterator[str]:
     """Yield a heading, the section's sentence and the table of its keys."""
     yield f"## {title[0].upper()}{title[1:]}\n"
     yield f"{_line(part['description'])}\n"
+    family = next((_NAMES[name] for name in _NAMES if defs[name] is part), "")
     rows = []
     for key, what in part["properties"].items():
         inner = _referred(what, defs)
-        section = inner is not None and inner is not defs["UserClass"]
-        meaning = what.get("description") or (inner or {}).get("description", "")
-        kind = "section" if section else _kind(what, defs)
-        default = _default(key, what, part)
-        rows.append((f"`{key}`", kind, what.get("unit", ""), default, _line(meaning)))
-    yield from _table(_COLUMNS, rows)
+        meaning = _line(what.get("description") or (inner or {}).get("description", ""))
+        if inner is not None and inner is not defs["UserClass"]:
+            kind, meaning = _linked(key, inner, defs, meaning)
+        elif key == "name" and family:
+            kind = f"[name](#{family.lower()})"
+        else:
+            kind = _unit(_kind(what, defs), what.get("unit", ""), meaning)
+        # Keys of several sections are explained where the first one has them.
+        first = explained.setdefault((key, meaning), title)
+        long = len(meaning.split()) > 8 and first != title
+        rows.append(
+            (f"`{key}`", kind, _default(key, what, part), f"As in {first}." if long else meaning)
+        )
+    yield from _table(("key", "value", "default", "meaning"), rows)
+
+
+def _linked(key: str, inner: Schema, defs: Schema, meaning: str) -> tuple[str, str]:
+    """Return the link to a section, and its meaning where the section does not state it."""
+    anchors = {"GainSpec": "gain-of-leader-or-follower"}
+    if inner is defs["GainSpec"]:
+        return f"[section](#{anchors['GainSpec']})", meaning
+    if _line(inner.get("description", "")) == meaning and key != "bursts":
+        return f"[section](#{key})", ""
+    return "section", meaning
+
+
+def _unit(kind: str, unit: str, meaning: str) -> str:
+    """Return the type with the unit, unless the meaning states it."""
+    stated = re.search(rf"(, |in (the )?){re.escape(unit)}( units)?\b", meaning) or not unit
+    return kind if stated else f"{kind}; {unit}"
 
 
 def _referred(what: Schema, defs: Schema) -> Schema | None:
@@ -92,7 +121,7 @@ def _kind(what: Schema, defs: Schema) -> str:
     return _scalar(what)
 
 
-_SCALARS = {"integer": "whole number", "number": "number", "boolean": "`true` or `false`"}
+_SCALARS = {"integer": "integer", "number": "number", "boolean": "`true`/`false`"}
 
 
 def _scalar(what: Schema) -> str:
@@ -101,8 +130,8 @@ def _scalar(what: Schema) -> str:
         return " or ".join(_kind({"type": each}, {}) for each in kind)
     name = _SCALARS.get(kind, "text" if kind == "string" else "anything")
     if "exclusiveMinimum" in what:
-        return f"{name} above {what['exclusiveMinimum']}"
-    return f"{name} of at least {what['minimum']}" if "minimum" in what else name
+        return f"{name} > {what['exclusiveMinimum']}"
+    return f"{name} >= {what['minimum']}" if "minimum" in what else name
 
 
 def _named(title: str, entries: Mapping[str, registry.Entry]) -> Iterator[str]:
