@@ -16,7 +16,7 @@ from echelon.experiments.scenario.scenario import json_schema
 _HEAD = """# Scenario keys
 
 All keys of a scenario file ([a first one](start.md)). A *section* is a mapping with the keys of its
-table below; a key without a default may be left out. *By state or group* means a mapping from names
+list below; a key without a default may be left out. *By state or group* means a mapping from names
 of the model, such as `{x: 1.0}` or `{position: 1.0}` for all its coordinates. Numbers are in SI
 units and angles in rad; *1* marks a number without a unit. `python: file.py:Class` names a class of
 [yours](extending.md). `docs/scenario_keys.py` writes the page.
@@ -24,7 +24,7 @@ units and angles in rad; *1* marks a number without a unit. `python: file.py:Cla
 Schema: TypeAlias = Mapping[str, Any]
 """A part of a JSON schema."""
 _NAMES = {"ModelSpec": "Models", "ReferenceSpec": "References"}
-"""Sections whose names have a table of their own."""
+"""Sections whose names have a list of their own."""
 
 
 def keys_page() -> str:
@@ -45,11 +45,11 @@ def keys_page() -> str:
 def _section(
     title: str, part: Schema, defs: Schema, explained: dict[tuple[str, str], str]
 ) -> Iterator[str]:
-    """Yield a heading, the section's sentence and the table of its keys."""
+    """Yield a heading, the section's sentence and the list of its keys."""
     yield f"## {title[0].upper()}{title[1:]}\n"
     yield f"{_line(part['description'])}\n"
     family = next((_NAMES[name] for name in _NAMES if defs[name] is part), "")
-    rows = []
+    rows, linked = list[str](), list[str]()
     for key, what in part["properties"].items():
         inner = _referred(what, defs)
         meaning = _line(what.get("description") or (inner or {}).get("description", ""))
@@ -62,10 +62,14 @@ def _section(
         # Keys of several sections are explained where the first one has them.
         first = explained.setdefault((key, meaning), title)
         long = len(meaning.split()) > 8 and first != title
-        rows.append(
-            (f"`{key}`", kind, _default(key, what, part), f"As in {first}." if long else meaning)
-        )
-    yield from _table(("key", "value", "default", "meaning"), rows)
+        value = ", ".join(filter(None, (kind, _default(key, what, part))))
+        if meaning:
+            rows.append(f"- `{key}` ({value}): {f'as in {first}.' if long else meaning}")
+        else:
+            linked.append(f"[`{key}`](#{key}){' (required)' * ('required' in value)}")
+    yield from [f"- Sections: {', '.join(linked)}."] * bool(linked)
+    yield from rows
+    yield ""
 
 
 def _linked(key: str, inner: Schema, defs: Schema, meaning: str) -> tuple[str, str]:
@@ -98,7 +102,7 @@ def _default(key: str, what: Schema, part: Schema) -> str:
     value = what.get("default")
     if value in (None, {}):
         return ""
-    return f"`{str(value).lower() if isinstance(value, bool) else value}`"
+    return f"default `{str(value).lower() if isinstance(value, bool) else value}`"
 
 
 def _kind(what: Schema, defs: Schema) -> str:
@@ -135,14 +139,13 @@ def _scalar(what: Schema) -> str:
 
 
 def _named(title: str, entries: Mapping[str, registry.Entry]) -> Iterator[str]:
-    """Yield the table of a family's names with the parameters of their classes."""
+    """Yield a family's names with the parameters of their classes."""
     yield f"## {title}\n"
     yield "The names and their keys; units are in the [reference](api.md).\n"
-    rows = []
     for name, entry in entries.items():
-        keys = inspect.signature(resolve(entry)).parameters.values()
-        rows.append((f"`{name}`", entry.summary, ", ".join(map(_key, keys)) or "none"))
-    yield from _table(("name", "what", "keys"), rows)
+        keys = ", ".join(map(_key, inspect.signature(resolve(entry)).parameters.values()))
+        yield f"- `{name}`: {'; '.join(filter(None, (entry.summary, keys)))}"
+    yield ""
 
 
 def _key(key: inspect.Parameter) -> str:
@@ -154,12 +157,6 @@ def _yaml(value: object) -> str:
     if isinstance(value, tuple):
         return f"[{', '.join(map(_yaml, value))}]"
     return str(value).lower() if isinstance(value, bool) or value is None else f"{value}"
-
-
-def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> Iterator[str]:
-    for row in (head, ("---",) * len(head), *rows):
-        yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |"
-    yield ""
 
 
 def _line(text: str) -> str:
