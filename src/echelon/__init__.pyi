@@ -58,6 +58,7 @@ from .experiments.studies.check import check as check
 from .experiments.studies.compare import compare as compare
 from .experiments.studies.design import design as design
 from .experiments.studies.observed_region import observed_region as observed_region
+from .experiments.studies.seed_comparison import compare_seeds as compare_seeds
 from .experiments.studies.state_space import state_space as state_space
 from .guarantees.promises.promise import Guarantee as Guarantee
 from .guarantees.promises.promise import guarantee as guarantee

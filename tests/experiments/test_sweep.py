@@ -28,6 +28,7 @@ from echelon.experiments.sweeps.workers import SweepBatch
 from echelon.guarantees.promises.promise import guarantee, promises
 from echelon.output.plots.study_figures import sweep_figures
 from echelon.simulation.engine import batch, law_drive
+from echelon.simulation.engine import batch as batches
 from echelon.simulation.engine.batch import Batch
 
 SHORT = ["simulation.horizon=0.5", "simulation.dt=0.01", "report.steady_window=0.1"]
@@ -412,8 +413,8 @@ def test_figures_show_the_shares_that_the_batches_hold():
 SMALL = """
 import signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)
-import echelon.experiments.sweeps.workers as sweeps
-sweeps._AGENT_STEPS = 1
+import echelon.simulation.engine.batch as batches
+batches._AGENT_STEPS = 1
 from echelon.apps.cli.app import main
 main()
 """
@@ -550,7 +551,7 @@ def test_a_killed_sweep_goes_on_with_the_same_bits_and_computes_nothing_again(
         computed.append(count)
         return honest(self, first, count, progress)
 
-    monkeypatch.setattr(sweeps, "_MOST", 8)
+    monkeypatch.setattr(batches, "_MOST", 8)
     monkeypatch.setattr(sweeps.Workers, "batch", batch)
     assert echelon("sweep", "--resume", "o", "--no-figures")[0] == 0
     assert computed == [8] * (4 - kept) and not (here / "o" / "batches").exists()
@@ -607,7 +608,7 @@ def test_a_cluster_gives_the_same_numbers_though_a_worker_is_killed(monkeypatch)
     sweeps_of = {"n_workers": 2, "threads_per_worker": 1, "processes": True}
     with distributed.LocalCluster(**sweeps_of, dashboard_address=None) as cluster:
         workers = [nanny.pid for nanny in cluster.workers.values()]
-        monkeypatch.setattr(sweeps, "_AGENT_STEPS", 1)
+        monkeypatch.setattr(batches, "_AGENT_STEPS", 1)
         compute(plan, alone.append)
 
         def keep(batch):

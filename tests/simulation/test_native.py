@@ -1,5 +1,6 @@
 """Native steps against JAX: states, inputs, sums and moments, for every feature of a run."""
 
+import json
 import time
 from collections.abc import Callable
 from concurrent import futures
@@ -118,8 +119,8 @@ def run_settings(**changes):
 DRAWN = {"paper-radio", "line-10", "van-der-pol", "yaw-turn"}
 LONG = [
     pytest.param(name, 1000, marks=pytest.mark.slow if name in DRAWN else pytest.mark.study)
-    # Two are without native code as yet, as is `reshape`; the last ends in six steps.
-    for name in sorted({*ech.bundled_scenarios()} - {"crossing", "leader-lost", "reshape"})
+    # Two are without native code; the last ends in six steps.
+    for name in sorted({*ech.bundled_scenarios()} - {"crossing", "reshape"})
     if name != "paper-literal"
 ]
 
@@ -131,6 +132,21 @@ LONG = [
 def test_a_scenario_steps_as_by_jax(name, steps):
     counts, tolerance = ((1, 0, 17, 60, 0), 1e-13) if steps == 60 else ((1000,), 1e-12)
     check_alike(*ech.build(ech.load_scenario(name)), counts, tolerance)
+
+
+@pytest.mark.parametrize(
+    ("name", "events"),
+    [
+        ("integrators", [{"at": 0.1, "lose": 3}, {"at": 0.3, "lose": 2}]),
+        ("unicycle", [{"at": 0.1, "lose": 3}, {"at": 0.25, "join": 3}]),
+        ("planar-quadrotor", [{"at": 0.1, "join": 2}]),
+        pytest.param("leader-lost", [{"at": 0.5, "lose": 0}], marks=pytest.mark.slow),
+    ],
+)
+def test_agents_that_are_lost_and_join_step_as_by_jax(name, events):
+    parts, chosen = ech.build(ech.load_scenario(name, [f"events={json.dumps(events)}"]))
+    steps = round(1.2 / chosen.dt) if name == "leader-lost" else 60
+    check_alike(parts, chosen, (7, steps, 0, 1, 13), 1e-13)
 
 
 WEIGHTED = ech.Graph.from_edges([(0, 1, 0.5), (1, 2, 3.0), (2, 3, 1.0), (0, 4, 2.0)], (0,), 5)

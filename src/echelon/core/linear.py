@@ -169,13 +169,17 @@ def longest_step(
     grows, and that last tenth is bisected; infinite where none grows up to a thousand times the
     slowest mode's. Shapes are those of `sampled_radius`.
     """
-    poles = np.linalg.eigvals(A - B @ gains)
-    # A mode on the imaginary axis has no slowest time; 1e-9 1/s keeps the search finite.
-    dt, end = 1e-3 / np.abs(poles).max(), 1e3 / max(1e-9, float(np.abs(poles.real).min()))
 
     def decays(dt: float) -> bool:
         return sampled_radius(A, B, gains, dt, integrator, substeps) < 1.0
 
+    return longest_decay(decays, np.linalg.eigvals(A - B @ gains))
+
+
+def longest_decay(decays: Callable[[float], bool], poles: np.ndarray) -> float:
+    """Return the longest step (s) with which loops decay, searched as `longest_step` does."""
+    # A mode on the imaginary axis has no slowest time; 1e-9 1/s keeps the search finite.
+    dt, end = 1e-3 / np.abs(poles).max(), 1e3 / max(1e-9, float(np.abs(np.real(poles)).min()))
     while decays(1.1 * dt):
         dt *= 1.1
         if dt > end:
@@ -245,6 +249,11 @@ def _equilibrated(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         matrix = sizes[:, None] * matrix / np.sqrt(np.where(across > 0.0, across, 1.0))
         rows *= sizes
     return matrix, rows
+
+
+def equilibrated_rank(matrix: np.ndarray) -> int:
+    """Return the rank of a matrix in any units: singular values above 1e-9 of the scaled one."""
+    return int((np.linalg.svd(_equilibrated(matrix)[0], compute_uv=False) > 1e-9).sum())
 
 
 def observability_rank(A: np.ndarray, C: np.ndarray) -> int:

@@ -66,6 +66,7 @@ class Topic(Word):
     DISTURBANCE_NETWORK = "disturbance, network"
     DISTURBANCE_MODE = "disturbance, one mode"
     STRING = "string gain"
+    INTEGRAL = "integral action"
 
 
 Line: TypeAlias = Hypothesis | Topic

@@ -32,6 +32,7 @@ from echelon.laws.law import (
     reference_of,
 )
 from echelon.synthesis.gains.gain import Gain
+from echelon.synthesis.gains.integral import Integral
 from echelon.synthesis.gains.strings import string_growth
 
 _Word = TypeVar("_Word", bound=Word)
@@ -64,6 +65,7 @@ class Consensus(Law, Faces, Feeds, Proves, Checks):
             receives, if the model has one; `world`, it does not, as in the paper.
         turning: whether the gain turns; set by `following`.
         angle: that heading, rad; set by `facing`.
+        integral: weights of the sums of outputs' errors, by `Integral.of`; None without sums.
     """
 
     gain: Gain
@@ -75,6 +77,7 @@ class Consensus(Law, Faces, Feeds, Proves, Checks):
     frame: Frame = eqx.field(default=Frame.HEADING, static=True, converter=_member("frame", Frame))
     turning: bool = eqx.field(default=False, static=True)
     angle: Scalar | None = None
+    integral: Integral | None = eqx.field(default=None, kw_only=True, converter=Integral.of)
 
     def __check_init__(self) -> None:
         if not isinstance(self.gain, Gain):
@@ -97,9 +100,9 @@ class Consensus(Law, Faces, Feeds, Proves, Checks):
         """Return the law with its gain in the axes of a heading (rad)."""
         return eqx.tree_at(lambda law: law.angle, self, heading, is_leaf=lambda part: part is None)
 
-    def metric(self, model: ControlAffine) -> Array:
-        """Return the gain's P."""
-        return self.gain.P
+    def metric(self, model: ControlAffine) -> Array | None:
+        """Return the gain's P; None with sums, of which no V of states is known."""
+        return self.gain.P if self.integral is None else None
 
     def prepared(self, model: ControlAffine, graph: Graph) -> "Consensus":
         """Check that the gain fits the model, and the feed-forward the graph."""
@@ -107,7 +110,10 @@ class Consensus(Law, Faces, Feeds, Proves, Checks):
         if self.feedforward is Feedforward.PARENT:
             # Raises where the graph is no tree; what it returns is computed again where it is used.
             graph.parents()
-        return self
+        if self.integral is None:
+            return self
+        integral = self.integral.prepared(model, self.gain, graph.spectrum())
+        return dataclasses.replace(self, integral=integral)
 
     def following(self, leader: Law, model: ControlAffine) -> "Consensus":
         """Let the gain turn if it changes with the heading, and the leader may change its own."""
@@ -121,16 +127,37 @@ class Consensus(Law, Faces, Feeds, Proves, Checks):
         """Warn of branches that amplify errors, under `parent` or with one-way edges."""
         alone = graph.directed and graph.schedule is None
         alone = alone and len(graph.edges) == len(graph.followers)
-        if self.feedforward is not Feedforward.PARENT and not alone:
+        if self.integral is not None or self.feedforward is not Feedforward.PARENT and not alone:
             return ()
         return string_growth(self.gain, model, graph)
 
+    def init(self) -> Memory:
+        """Return the sums of outputs' errors, if there are any."""
+        return None if self.integral is None else self.integral.begin()
+
+    def settle(
+        self,
+        model: ControlAffine,
+        view: LocalView,
+        desired: Input,
+        delivered: Input,
+        memory: Memory,
+    ) -> Memory:
+        """Return the sums after a step."""
+        if self.integral is None:
+            return memory
+        known = view.x, view.disagreement, view.period
+        return self.integral.settle(model, known, memory, (desired, delivered), self.angle)
+
     def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
         """Return the input of one agent."""
-        forward = view.feedforward
+        forward, known = view.feedforward, (view.x, view.disagreement)
         if self.feedforward is Feedforward.RELAY_VELOCITY:
             forward = _match_velocity(self, model, view.x, forward)
-        v = forward - self.gain.feedback(model, view.x, view.disagreement, self.angle)
+        if self.integral is None:
+            v = forward - self.gain.feedback(model, *known, self.angle)
+        else:
+            v = forward - self.integral.feedback(model, *known, memory, self.angle)
         v = v + self.gain.inner_loop(model, view.x, self.angle)
         return model.physical(v, trim=self.trim), memory
 

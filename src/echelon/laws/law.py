@@ -22,6 +22,7 @@ from echelon.core.types import Array, Declared, Input, PyTree, Scalar, State
 from echelon.core.words import Feedforward
 from echelon.laws.safety import Safety
 from echelon.synthesis.gains.gain import Gain
+from echelon.synthesis.gains.integral import Integral
 
 Memory: TypeAlias = PyTree
 
@@ -396,6 +397,9 @@ def check_gain_fits(
 
 def gain_of(law: Law) -> Gain | None:
     """Return the gain of a law, of a prepared leader the one in use; None where it has none."""
+    # With sums a law does more than its gain, and no statement about the gain is about it.
+    if isinstance(getattr(law, "integral", None), Integral):
+        return None
     # By name, since a user's own law need not have one.
     named = (getattr(law, name, None) for name in ("regulator", "gain"))
     return next((gain for gain in named if isinstance(gain, Gain)), None)

@@ -29,6 +29,7 @@ from echelon.core.numerics import precision
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.laws.law import Expected, Faces, Law, LocalView, Memory, Travels, check_gain_fits
 from echelon.synthesis.gains.gain import Gain
+from echelon.synthesis.gains.integral import Integral
 from echelon.synthesis.gains.riccati import Riccati
 
 # ---- the path, and how others predict it ---------------------------------------------------------
@@ -115,12 +116,14 @@ class Tracking(PathLeader):
         reaction: the followers' gain, when the leader reacts to them.
         turns: whether the gains turn with the reference's heading; set by `prepared`.
         regulator: the tracking gain in use; set by `prepared`.
+        integral: weights of the sums of outputs' errors, by `Integral.of`; None without sums.
     """
 
     gain: Gain | None = None
     reaction: Gain | None = None
     turns: bool = eqx.field(default=False, static=True)
     regulator: Gain | None = None
+    integral: Integral | None = eqx.field(default=None, kw_only=True, converter=Integral.of)
 
     @property
     def information(self) -> tuple[str, ...]:
@@ -147,7 +150,16 @@ class Tracking(PathLeader):
                 f"{still or 'its flat state and input are not finite at t = 0 s'}."
             )
         turns = model.heading is not None and not self.keeps_heading(model)
-        return Tracking(self.reference, self.gain, self.reaction, turns, regulator)
+        sums = self.integral and self.integral.prepared(model, regulator, OWN)
+        return Tracking(self.reference, self.gain, self.reaction, turns, regulator, integral=sums)
+
+    def init(self) -> Memory:
+        """Return the sums of outputs' errors, if there are any."""
+        return None if self.integral is None else self.integral.begin()
+
+    def own_mode(self, model: ControlAffine) -> float | None:
+        """Return the slowest mode with sums, 1/s; None without, where it is that of the gain."""
+        return None if self.integral is None else self.integral.slowest(model, np.ones(1))
 
     def target(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:
         """Return (x_r, u_r) at time t."""
@@ -157,15 +169,41 @@ class Tracking(PathLeader):
         """Return the leader's input."""
         if self.regulator is None:
             raise LawError("`Tracking` has no gain yet; call `prepared(model, graph)` first.")
-        state, u = self.target(model, view.t)
-        heading = self.heading(model, view.t, view.x) if self.turns else None
-        # With several leaders each follows the reference at an offset of its own.
-        error = model.difference(view.x, state + view.offset)
-        v = self.regulator.feedback(model, view.x, error, heading)
+        error, u, heading = self._error(model, view)
+        if self.integral is None:
+            v = self.regulator.feedback(model, view.x, error, heading)
+        else:
+            v = self.integral.feedback(model, view.x, error, memory, heading)
         # Normalized inputs are added, and the trim once: it is in u already.
         if self.reaction is not None:
             v = v + self.reaction.feedback(model, view.x, view.disagreement, heading)
         return u - model.physical(v, trim=False), memory
+
+    def settle(
+        self,
+        model: ControlAffine,
+        view: LocalView,
+        desired: Input,
+        delivered: Input,
+        memory: Memory,
+    ) -> Memory:
+        """Return the sums after a step."""
+        if self.integral is None:
+            return memory
+        error, _, heading = self._error(model, view)
+        known = view.x, error, view.period
+        return self.integral.settle(model, known, memory, (desired, delivered), heading)
+
+    def _error(self, model: ControlAffine, view: LocalView) -> tuple[State, Input, Scalar | None]:
+        """Return the error (n,), the reference's input, and the heading of the gain's axes."""
+        state, u = self.target(model, view.t)
+        heading = self.heading(model, view.t, view.x) if self.turns else None
+        # With several leaders each follows the reference at an offset of its own.
+        return model.difference(view.x, state + view.offset), u, heading
+
+
+OWN = Spectrum(np.ones(1), 1, 1.0)
+"""The eigenvalue of a leader that knows its reference directly."""
 
 
 def tracking_gain(law: Law, model: ControlAffine, gain: Gain | None) -> Gain:
@@ -176,7 +214,7 @@ def tracking_gain(law: Law, model: ControlAffine, gain: Gain | None) -> Gain:
     """
     # The coupling compensates lambda_min of a network; a leader knows its reference directly.
     if gain is None:
-        gain = Riccati(coupling=1.0).solve(model, Spectrum(np.ones(1), 1, 1.0))
+        gain = Riccati(coupling=1.0).solve(model, OWN)
     check_gain_fits(law, model, gain.P.shape, gain.R.shape)
     return gain if gain.coupling == 1.0 else eqx.tree_at(lambda g: g.coupling, gain, 1.0)
 

@@ -49,8 +49,10 @@ class Vehicle:
         self.u: list[float] | None = None
         self.heard, self.descends, self.address = -math.inf, False, None
         self._memory: list[float] = list(facts["memory"])
-        self._draws = random.Random(f"{facts['seed']} {number}")
-        self._gust = [rms * self._draws.gauss(0.0, 1.0) for rms in facts["rms"]]
+        # Two streams, so that gusts do not depend on how often sensors are read.
+        self._gusts = random.Random(f"{facts['seed']} {number}")
+        self._noise = random.Random(f"{facts['seed']} {number} sensors")
+        self._gust = [rms * self._gusts.gauss(0.0, 1.0) for rms in facts["rms"]]
 
     address: Any
 
@@ -63,7 +65,7 @@ class Vehicle:
     def measured(self) -> list[float]:
         """Return the state with the noise of its sensors."""
         pairs = zip(self.x, self._facts["noise"], strict=True)
-        return [x + rms * self._draws.gauss(0.0, 1.0) if rms else x for x, rms in pairs]
+        return [x + rms * self._noise.gauss(0.0, 1.0) if rms else x for x, rms in pairs]
 
     def advance(self, now: float, silent: float) -> None:
         """Move on by a substep; after a silence (s) its autopilot acts."""
@@ -74,7 +76,7 @@ class Vehicle:
         facts, fade = self._facts, self._facts["fade"]
         size = math.sqrt(1.0 - fade * fade)
         self._gust = [
-            fade * gust + size * rms * self._draws.gauss(0.0, 1.0) if rms else 0.0
+            fade * gust + size * rms * self._gusts.gauss(0.0, 1.0) if rms else 0.0
             for gust, rms in zip(self._gust, facts["rms"], strict=True)
         ]
         push = [a + b for a, b in zip(facts["constant"], self._gust, strict=True)]

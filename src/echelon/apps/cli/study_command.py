@@ -1,6 +1,7 @@
 """`echelon check`, `causes`, `design` and `compare`: studies of a scenario."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,6 +10,7 @@ import typer
 from echelon.apps.cli import options, tables
 from echelon.apps.cli.options import JsonOption, ScenarioArgument, SetOption
 from echelon.apps.cli.terminal import STATUS, STOP
+from echelon.core.errors import ScenarioError
 from echelon.output.archive.folder import claim_design, write_errors
 
 if TYPE_CHECKING:
@@ -16,7 +18,6 @@ if TYPE_CHECKING:
     from echelon.experiments.scenario.build import Experiment
     from echelon.experiments.scenario.scenario import Scenario
     from echelon.experiments.studies.causes import CauseStudy
-    from echelon.experiments.studies.compare import Comparison
     from echelon.experiments.studies.observed_region import ObservedRegion
     from echelon.simulation.engine.parts import Parts
     from echelon.simulation.engine.result import Result
@@ -185,7 +186,14 @@ def compare(
     ],
     horizon: Annotated[float, typer.Option(help="Duration of every run, s.")] = 10.0,
     method: Annotated[
-        list[str] | None, typer.Option(help="Only this method; repeat the option for several.")
+        list[str] | None,
+        typer.Option(help="Only this method, or your law `FILE.py:CLASS`; repeat for several."),
+    ] = None,
+    seeds: Annotated[
+        str | None,
+        typer.Option(
+            metavar="0..199", help="Run each method on all these seeds; by default, the laws."
+        ),
     ] = None,
     set_: options.SetOption = None,
     out: options.FolderOption = None,
@@ -201,24 +209,38 @@ def compare(
     changes = [f"simulation.horizon={horizon!r}", *(set_ or [])]
     loaded = [load_scenario(name, changes) for name in scenarios]
     names = ", ".join(scenario.name for scenario in loaded)
-    STATUS.begin(f"comparing methods on {names}, which takes minutes", not as_json)
+    minutes = ", which takes minutes" * (seeds is None)
+    STATUS.begin(f"comparing methods on {names}{minutes}", not as_json)
     from echelon.experiments.scenario.build import build
-    from echelon.experiments.studies.compare import known_labels
+    from echelon.experiments.studies.compare import known_labels, laws_of
     from echelon.output.archive.folder import claim_folders
-    from echelon.output.reports.comparison_report import comparison_mapping
 
-    labels = known_labels(method)
+    drawn = None if seeds is None else _read_seeds(seeds)
+    labels = known_labels(method, slow=drawn is None)
     experiments = [build(scenario, to_run=True) for scenario in loaded]
+    for scenario, experiment in zip(loaded, experiments, strict=True):
+        laws_of(scenario, experiment.parts, labels)
     folders = claim_folders([scenario.name for scenario in loaded], out, force)
     with STOP.hold():
-        comparisons = [
-            _compare(*job, labels, figures, as_json, as_latex)
+        rows = [
+            _compare(*job, labels, drawn, figures, as_json, as_latex)
             for job in zip(loaded, experiments, folders, strict=True)
         ]
     if as_json:
-        rows = [comparison_mapping(comparison) for comparison in comparisons]
         print(json.dumps(rows[0] if len(rows) == 1 else rows, indent=2))
     raise typer.Exit(STOP.exit_code)
+
+
+def _read_seeds(text: str) -> Sequence[int]:
+    from echelon.experiments.sweeps.plan import read_axes
+
+    try:
+        (axis,) = read_axes([f"seed={text}"])
+    except ScenarioError as error:
+        raise ScenarioError(str(error).replace("--over seed", "--seeds", 1)) from error
+    if not all(isinstance(seed, int) and seed >= 0 for seed in axis.values):
+        raise ScenarioError(f"--seeds {text}: allowed are whole numbers from 0 on, as `0..199`.")
+    return axis.values
 
 
 def _compare(
@@ -226,11 +248,13 @@ def _compare(
     experiment: "Experiment",
     folder: Path,
     labels: tuple[str, ...],
+    seeds: Sequence[int] | None,
     figures: bool,
     quiet: bool,
     as_latex: bool,
-) -> "Comparison":
+) -> "JsonObject":
     from echelon.experiments.studies.compare import compare as simulate
+    from echelon.experiments.studies.seed_comparison import compare_seeds
     from echelon.output.archive.study_folder import Flights, write_comparison
     from echelon.output.reports.comparison_report import (
         comparison_mapping,
@@ -244,7 +268,11 @@ def _compare(
 
     flights = Flights(folder)
     STATUS.begin(f"comparing on {scenario.name}", not quiet)
-    comparison = simulate(scenario, experiment, labels, progress, flights.write)
+    comparison = (
+        simulate(scenario, experiment, labels, progress, flights.write)
+        if seeds is None
+        else compare_seeds(scenario, seeds, experiment, labels, progress)
+    )
     # Printed before anything more is written, so that a full disk loses nothing of it.
     if not quiet:
         print_comparison(tables.console(as_latex=as_latex), comparison)
@@ -253,4 +281,4 @@ def _compare(
     write_comparison(comparison, rows, text, folder, figures)
     if not quiet:
         tables.print_folder(folder)
-    return comparison
+    return rows

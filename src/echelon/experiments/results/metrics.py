@@ -30,7 +30,7 @@ from echelon.experiments.results.run_numbers import (
     Metrics,
 )
 from echelon.guarantees.promises.coverage import covered
-from echelon.guarantees.promises.promise import Guarantee
+from echelon.guarantees.promises.promise import Guarantee, guarantee
 from echelon.simulation.engine.result import Result
 from echelon.simulation.step.meter import SETTLED, output_error, steps_per_slice
 
@@ -255,14 +255,20 @@ class RunNumbers:
     """A run with what its numbers are computed from.
 
     Attributes:
+        stated: what is guaranteed of it; computed when it is first needed, if None.
         computing: computing time (s) for one agent and one second of the run, without compilation;
             None if it was not measured.
     """
 
     result: Result
     metrics: Metrics
-    promise: Guarantee
+    stated: Guarantee | None = None
     computing: float | None = None
+
+    @functools.cached_property
+    def promise(self) -> Guarantee:
+        """What is guaranteed of the run."""
+        return self.stated or guarantee(self.result.parts, self.result.settings)
 
     def number(self, name: str) -> float | None:
         """Return a number of `RUN_NUMBERS`; None if it does not exist or is more than one."""

@@ -44,6 +44,8 @@ class Appearance(enum.Flag):
     """In the JSON of a comparison, and in its table of costs if the number has a column."""
     SUMMARY = enum.auto()
     """In the summary of a run."""
+    SEEDS = enum.auto()
+    """In a comparison over many seeds, as a distribution and as paired differences."""
 
 
 class Quantity(NamedTuple):
@@ -60,6 +62,7 @@ class Quantity(NamedTuple):
         scale: of the number in tables: 100 for a percentage.
         digits: most digits in tables.
         absent: in tables, if the number does not exist.
+        more_is_better: whether a larger number is the better one.
     """
 
     meaning: str
@@ -72,6 +75,7 @@ class Quantity(NamedTuple):
     scale: float = 1.0
     digits: int = 4
     absent: str = "-"
+    more_is_better: bool = False
 
     def cell(self, value: float | None, digits: int = 4) -> str:
         """Return the number as a cell of a table."""
@@ -226,12 +230,14 @@ RUN_NUMBERS: Mapping[str, Quantity] = {
         ERROR,
         "formation RMSE",
         of=lambda run: run.root_mean("rmse"),
-        shown=Appearance.SWEEP | Appearance.DISTRIBUTION,
+        shown=Appearance.SWEEP | Appearance.DISTRIBUTION | Appearance.SEEDS,
     ),
     "formation_steady_rmse": Quantity(
         "root mean square of the followers' errors in the steady window",
         ERROR,
+        "steady RMSE",
         of=lambda run: run.root_mean("steady_rmse"),
+        shown=Appearance.SWEEP | Appearance.SEEDS,
     ),
     "worst_rmse": Quantity(
         "largest RMSE of a follower", ERROR, of=lambda run: run.worst("rmse"), shown=Appearance(0)
@@ -254,7 +260,7 @@ RUN_NUMBERS: Mapping[str, Quantity] = {
         "s",
         "settling time",
         of=lambda run: run.metrics.settled_from,
-        shown=Appearance.SWEEP | Appearance.DISTRIBUTION | Appearance.COMPARISON,
+        shown=Appearance.SWEEP | Appearance.DISTRIBUTION | Appearance.COMPARISON | Appearance.SEEDS,
         key="settling_time_s",
         absent="never",
     ),
@@ -272,10 +278,11 @@ RUN_NUMBERS: Mapping[str, Quantity] = {
     ),
     "effort": Quantity(
         "root mean square of the followers' normalized inputs about the trim",
+        label="effort",
         column="effort",
         # The mean of the squares: the root mean square of all inputs together.
         of=lambda run: run.root_mean("effort"),
-        shown=Appearance.COMPARISON,
+        shown=Appearance.COMPARISON | Appearance.SEEDS,
     ),
     "saturation_fraction": Quantity(
         "mean over all agents of `saturated`",
@@ -288,9 +295,11 @@ RUN_NUMBERS: Mapping[str, Quantity] = {
     "minimum_distance": Quantity(
         "smallest distance between any two agents, over all steps",
         "m",
+        "smallest distance",
         column="smallest\ndistance",
         of=lambda run: run.metrics.minimum_distance,
-        shown=Appearance.COMPARISON | Appearance.SUMMARY,
+        shown=Appearance.COMPARISON | Appearance.SUMMARY | Appearance.SEEDS,
+        more_is_better=True,
     ),
     "minimum_distance_time": Quantity(
         "time at which two agents were closest to each other",

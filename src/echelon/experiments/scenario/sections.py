@@ -28,6 +28,7 @@ from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.values import (
     Agent,
     Agents,
+    Allowed,
     ClassInFile,
     Count,
     Edges,
@@ -379,6 +380,11 @@ _STOPPING = TakenBy("stopping-point")
 _Roots = Annotated[tuple[Positive, ...] | None, Field(strict=False), Unit("1/s"), _STOPPING]
 _Rate = Annotated[Positive | None, Unit("1/s"), _STOPPING]
 _Speed = Annotated[Speed | None, Unit("the outputs' per s"), _STOPPING]
+_Weights = Annotated[
+    bool | NotNegative | Annotated[tuple[NotNegative, ...], Field(strict=False)],
+    Allowed("is `true`, a number of at least 0, or a list of such numbers"),
+]
+_PER_SUM = Unit("1 over the outputs' squared, per s^2")
 
 
 def law_arguments(section: BaseModel) -> dict[str, object]:
@@ -432,6 +438,9 @@ class LeaderSpec(Section):
     gain: Annotated[GainSpec | None, TakenBy("tracking", "optimal-tracking")] = None
     """Gain of the leader's tracking, under `tracking` and `optimal-tracking`; default the model's
     Riccati gain."""
+    integral: Annotated[_Weights | None, _PER_SUM, TakenBy("tracking")] = None
+    """Whether the leader sums the errors of its position and its heading, which removes those of
+    constant pushes: `true`, or the weights of the sums, one for all or one for each."""
 
     def inner_loop(self, follower: "FollowerSpec") -> dict[str, object]:
         """Return the leader's roots or rate of the inner loop; without any, the followers'."""
@@ -479,6 +488,9 @@ class FollowerSpec(Section):
     frame: Annotated[str, OneOf(map(str, Frame)), TakenBy("consensus")] = str(Frame.HEADING)
     """Axes of the gain, under `consensus`: `heading`, they turn with the leader's desired heading,
     if the model has one; `world`, they are fixed, as in the paper."""
+    integral: Annotated[_Weights | None, _PER_SUM, TakenBy("consensus")] = None
+    """Whether followers sum the errors of positions and heading, which removes those of constant
+    pushes: `true`, or the weights of the sums, one for all or one for each."""
     trim: Annotated[bool, TakenBy("consensus")] = True
     """Whether the law adds the trim input, such as a quadrotor's weight; the paper's printed law
     does not."""

@@ -18,6 +18,7 @@ from echelon.experiments.studies.observed_region import ObservedRegion
 from echelon.guarantees.local.spectra import Split
 from echelon.guarantees.local.step_margins import delay_margin, gain_margin
 from echelon.guarantees.promises.closed_loop import LinearLoop
+from echelon.guarantees.promises.integral_modes import sum_costs, sum_lines
 from echelon.guarantees.promises.promise import AgreementModes, Guarantee, guarantee
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
@@ -37,6 +38,7 @@ _STIFF = 1e10
 def margin_lines(parts: Parts, settings: Settings, promise: Guarantee) -> Iterator[Statement]:
     """Yield the margins of a stable loop."""
     loop = promise.loop
+    yield from sum_lines(parts, loop)
     if parts.graph.schedule is not None:
         yield from _switching_lines(promise)
         return
@@ -44,6 +46,9 @@ def margin_lines(parts: Parts, settings: Settings, promise: Guarantee) -> Iterat
         text = "any coupling; the delay margin depends only on c and the graph"
         yield unneeded(Topic.MARGINS, _KIND, text)
         yield from _agreement_lines(promise.agreement)
+        return
+    if promise.decays and any(sum_costs(parts, loop)):
+        yield from _step_lines(promise.steps, settings.dt)
         return
     if not promise.governed:
         yield unneeded(Topic.MARGINS, _KIND, "no modes of this loop are known")

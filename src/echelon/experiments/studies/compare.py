@@ -1,5 +1,6 @@
 """Compares methods on one scenario: the same agents, starts, limits and disturbance."""
 
+import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -7,18 +8,24 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import numpy as np
 
-from echelon.core.errors import EchelonError, LawError, check_name
+from echelon.core.errors import EchelonError, LawError, ScenarioError, check_name
 from echelon.core.numerics import precision
 from echelon.core.words import Feedforward
 from echelon.experiments.results.metrics import RunNumbers, metrics
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.build import Experiment, build
-from echelon.experiments.scenario.scenario import ScenarioLike, as_scenario
+from echelon.experiments.scenario.scenario import (
+    Scenario,
+    ScenarioLike,
+    as_scenario,
+    with_overrides,
+)
+from echelon.experiments.scenario.yaml import inline_yaml
 from echelon.guarantees.promises.promise import guarantee
 from echelon.laws.consensus import Consensus
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 from echelon.simulation.engine.law_drive import Laws
-from echelon.simulation.engine.parts import Parts, initial_states
+from echelon.simulation.engine.parts import Parts, Starts
 from echelon.simulation.engine.simulate import RunSoFar, simulate
 from echelon.simulation.optimal.drives import Plans, RecedingHorizon
 from echelon.simulation.optimal.leader import OptimalTracking
@@ -28,7 +35,7 @@ from echelon.synthesis.gains.gain import FixedGain, Gain, Method, synthesize
 from echelon.synthesis.gains.riccati import InnerLoop, Riccati
 
 OWN = "own"
-"""Label of the scenario's drive."""
+"""Stands for the scenario's drive among the methods to run."""
 PLANNED_LEADER, PLANNED = "optimal-leader", "optimization"
 """Labels of the paper's two methods: consensus behind a planned leader, and plans alone."""
 
@@ -67,6 +74,8 @@ _LAW_NAMES = {
     entry.target.rpartition(":")[2]: name for name, entry in registry.FOLLOWER_LAWS.items()
 }
 
+INTERRUPTED = "it was not run because of an interruption."
+
 DriveOf = Callable[[Parts, Settings], Controller]
 """Returns the drive of a method for the parts and the settings of a scenario."""
 
@@ -100,7 +109,7 @@ def _behind_a_plan(parts: Parts, settings: Settings) -> Controller:
     reference, first = _reference(parts), parts.graph.leaders[0]
     if reference is None:
         raise LawError("`optimal-leader` plans along a reference, and there is none.")
-    # The plan begins where the leader does: `_with_starts` has drawn all starts.
+    # The plan begins where the leader does: `with_starts` has drawn all starts.
     start = np.asarray(parts.initial)[first] - parts.formation.offsets[first]
     with precision("float64"):
         error = start - np.asarray(OptimalTracking(reference).start(parts.model))
@@ -128,22 +137,80 @@ LABELS = tuple(_DRIVES)
 """The methods that are compared."""
 
 
-def known_labels(requested: Sequence[str] | None) -> tuple[str, ...]:
-    """Return the requested methods in the order of `LABELS`, then `own`; by default all.
+SLOW = (PLANNED_LEADER, PLANNED, "mpc")
+"""Methods that solve optimization problems, which take seconds to minutes for each run."""
+
+MethodRun = Callable[[str, DriveOf], Controller | None]
+"""Runs a method under its label, and returns the completed drive; None if nothing ran."""
+
+
+def known_labels(requested: Sequence[str] | None, slow: bool = True) -> tuple[str, ...]:
+    """Return the requested methods: of `LABELS` in their order, laws of the user's, and `own`.
+
+    A law of the user's is `mine.py:Law`, or a mapping as that of `follower.law`, `{python:
+    "mine.py:Law", rate: 2}`. By default these are all labels, without those of `SLOW` if not
+    `slow`.
 
     Raises:
         LawError: a label is unknown.
     """
     allowed = (*LABELS, OWN)
-    for label in requested or ():
-        check_name("`--method` is", label, allowed, LawError)
-    return tuple(label for label in allowed if not requested or label in requested)
+    if not requested:
+        return tuple(label for label in allowed if slow or label not in SLOW)
+    laws = tuple(dict.fromkeys(filter(_is_law, requested)))
+    for label in requested:
+        if label not in laws:
+            check_name("`--method` is", label, allowed, LawError)
+    named = tuple(label for label in LABELS if label in requested)
+    return (*named, *laws, *[OWN][: OWN in requested])
+
+
+def _is_law(text: str) -> bool:
+    return text.lstrip().startswith("{") or ".py:" in text
+
+
+def run_each(scenario: Scenario, parts: Parts, only: Sequence[str], fly: MethodRun) -> None:
+    """Run each method; the scenario's own drive only if no other method has the same.
+
+    Raises:
+        ScenarioError: a law of the user's cannot be built.
+    """
+    laws = laws_of(scenario, parts, only)
+    flown = {label: fly(label, _DRIVES[label]) for label in only if label in _DRIVES}
+    for label, law in laws.items():
+        flown[label] = fly(label, lambda parts, settings, law=law: law)
+    drive = parts.drive.prepare(parts.model, parts.graph.before)
+    # By value, gains included: the scenario may describe one of the methods.
+    if OWN in only and not any(eqx.tree_equal(drive, other) for other in flown.values()):
+        label = _label(drive)
+        fly(f"{label}, own" if label in flown else label, lambda parts, settings: parts.drive)
+
+
+def laws_of(scenario: Scenario, parts: Parts, only: Sequence[str]) -> dict[str, Controller]:
+    """Return the user's laws by their class, with the keys in which those of one class differ.
+
+    Raises:
+        ScenarioError: one cannot be built.
+    """
+    keys, drives = list[Mapping[str, object]](), list[Controller]()
+    for text in filter(_is_law, only):
+        law = text if text.lstrip().startswith("{") else f"{{python: {json.dumps(text)}}}"
+        changed, built = _with_law(scenario, law)
+        drives.append(built.parts.drive)
+        keys.append(changed.data["follower"]["law"])
+    kinds = [_label(drive.prepare(parts.model, parts.graph.before)) for drive in drives]
+    labels = list[str]()
+    for kind, mine in zip(kinds, keys, strict=True):
+        alike = [other for other, name in zip(keys, kinds, strict=True) if name == kind]
+        differ = {k: v for k, v in mine.items() if any(other.get(k) != v for other in alike)}
+        labels.append(kind + f"({inline_yaml(differ)[1:-1]})" * bool(differ))
+    return dict(zip(labels, drives, strict=True))
 
 
 def compare(
     scenario: ScenarioLike,
     built: Experiment | None = None,
-    only: tuple[str, ...] = (*LABELS, OWN),
+    only: Sequence[str] = (*LABELS, OWN),
     progress: Callable[[str, float, int], None] = lambda label, done, methods: None,
     landed: Callable[[ComparisonRow], None] = lambda row: None,
 ) -> Comparison:
@@ -153,7 +220,8 @@ def compare(
         scenario: the agents, their graph, formation, starts, conditions and horizon; a scenario,
             its name, its file, or a mapping.
         built: its parts and settings; built if None.
-        only: the labels of the methods; `own` for the scenario's drive.
+        only: the labels of the methods; `own` for the scenario's drive, or a law of your own as
+            the scenario writes it, `{python: "mine.py:Law", rate: 2}`.
         progress: called between chunks of steps and between runs, with the label of the method,
             how many methods are done (with a part of this one), and how many there are; if it
             raises KeyboardInterrupt, the remaining methods have a row with that reason.
@@ -168,10 +236,10 @@ def compare(
     """
     scenario = as_scenario(scenario)
     parts, settings = build(scenario) if built is None else built
-    scene = _with_starts(parts, settings)
+    [scene] = with_starts(parts, [settings.seed])
     rows = list[ComparisonRow]()
 
-    def fly(label: str, drive: DriveOf) -> None:
+    def fly(label: str, drive: DriveOf) -> Controller | None:
         def part(done: float) -> None:
             progress(label, len(rows) + done, len(only))
 
@@ -179,17 +247,19 @@ def compare(
             part(0.0)
             rows.append(_row(label, drive, scene, settings, part))
         except KeyboardInterrupt:
-            rows.append(ComparisonRow(label, None, "it was not run because of an interruption."))
+            rows.append(ComparisonRow(label, None, INTERRUPTED))
         landed(rows[-1])
+        return None if rows[-1].flight is None else rows[-1].flight.result.drive
 
-    for label in (label for label in only if label != OWN):
-        fly(label, _DRIVES[label])
-    own = _own_label(parts, rows) if OWN in only else None
-    if own is not None:
-        fly(own, lambda parts, settings: parts.drive)
-    described = parts.world.describe(parts.model)
-    conditions = tuple(f"{name}: {text}" for name, text in described.items() if text)
+    run_each(scenario, parts, only, fly)
+    conditions = conditions_of(parts)
     return Comparison(scenario.name, tuple(rows), settings.horizon, settings.window, conditions)
+
+
+def conditions_of(parts: Parts) -> tuple[str, ...]:
+    """Return wind and plant in words; empty where there are none."""
+    described = parts.world.describe(parts.model)
+    return tuple(f"{name}: {text}" for name, text in described.items() if text)
 
 
 def _row(
@@ -203,13 +273,13 @@ def _row(
         return ComparisonRow(label, None, str(error))
 
 
-def _with_starts(parts: Parts, settings: Settings) -> Parts:
-    """Return the parts with random starts drawn once, the leader's error included."""
+def with_starts(parts: Parts, seeds: Sequence[int]) -> list[Parts]:
+    """Return the parts with the starts of each seed, the leader's error included."""
     with precision("float64"):
         drive = parts.drive.prepare(parts.model, parts.graph.before)
-        states = initial_states(parts.replace(drive=drive), settings.seed)
+        starts = Starts(parts.replace(drive=drive)).of(seeds)
     # The states contain the leader's error already.
-    return parts.replace(initial=states, start_error={})
+    return [parts.replace(initial=states, start_error={}) for states in starts]
 
 
 def _fly(parts: Parts, settings: Settings, part: Callable[[float], None]) -> RunNumbers:
@@ -238,17 +308,21 @@ class _Watch:
         return (last - first) * total / max(1, done - begun)
 
 
-def _own_label(parts: Parts, rows: list[ComparisonRow]) -> str | None:
-    """Return the label of the scenario's drive; None if another row has the same drive."""
-    drive = parts.drive.prepare(parts.model, parts.graph.before)
-    others = (row.flight.result.drive for row in rows if row.flight is not None)
-    # By value, gains included: the scenario may describe one of the methods.
-    if any(eqx.tree_equal(drive, other) for other in others):
-        return None
+def _with_law(scenario: Scenario, law: str) -> tuple[Scenario, Experiment]:
+    """Return a scenario under a law, with gain and feed-forward if the law takes them."""
+    for change in (f"follower.law={law}", f"follower={{law: {law}}}"):
+        try:
+            changed = with_overrides(scenario, [change])
+            return changed, build(changed)
+        except ScenarioError as error:
+            why = str(error).replace(f"--set {change}", f"--method {law}")
+    raise ScenarioError(why)
+
+
+def _label(drive: Controller) -> str:
     law, gain, feedforward = getattr(drive, "follower", drive), drive.gain, drive.feedforward
     kind = type(law).__name__
-    name = _LAW_NAMES.get(kind, kind) if gain is None else gain.method
-    label = name if feedforward is Feedforward.NONE else f"{name}-{feedforward}"
     if not type(law).__module__.startswith("echelon."):
-        label = kind
-    return f"{label}, own" if label in {row.label for row in rows} else label
+        return kind
+    name = _LAW_NAMES.get(kind, kind) if gain is None else gain.method
+    return name if feedforward is Feedforward.NONE else f"{name}-{feedforward}"

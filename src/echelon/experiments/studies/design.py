@@ -21,13 +21,17 @@ from echelon.experiments.scenario.scenario import Scenario
 from echelon.experiments.scenario.sections import GainSpec
 from echelon.experiments.scenario.yaml import ScenarioFault
 from echelon.guarantees.local.step_margins import GainMargin, delay_margin, gain_margin
+from echelon.guarantees.promises.integral_modes import sum_costs, sum_sentence
 from echelon.guarantees.promises.promise import Guarantee, guarantee
 from echelon.laws.consensus import Consensus
+from echelon.laws.integral_check import sums_of
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
+from echelon.simulation.step.drive import Controller
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates.domain import Domain
 from echelon.synthesis.gains.gain import FixedGain, Gain, Method, synthesize
+from echelon.synthesis.gains.integral import Integral
 from echelon.synthesis.gains.riccati import InnerLoop
 
 
@@ -69,6 +73,8 @@ class Design(NamedTuple):
         """
         assert self.promise is not None
         region, slowest = self.promise.region, self.promise.loop.slowest
+        if not self.promise.governed:
+            slowest = self.promise.slowest or 0.0
         if region is None:
             return self.step > dt, 0, 0, -slowest
         theorem = _RANK[region.theorem]
@@ -178,6 +184,8 @@ def because(best: Design, designs: tuple[Design, ...], dt: float) -> str:
         step = f"It needs a step below {at_most(best.step)} s; the scenario's is {dt:g} s."
     others = [d for d in designs if d.stable and d is not best]
     text = f"Recommended: {best.method}. {_advantage(best, others, dt)} {step}"
+    assert best.parts is not None
+    text = f"{text} {sum_sentence(best.parts, best.promise.loop)}".rstrip()
     # The step has been mentioned.
     reasons = [
         line.reason
@@ -247,10 +255,16 @@ def with_gain(parts: Parts, gain: Gain) -> Parts:
     A leader that reacts to its neighbours does so by this gain.
     """
     drive = parts.drive
-    law = Consensus(gain, drive.feedforward, drive.trimmed, drive.frame)
+    law = Consensus(gain, drive.feedforward, drive.trimmed, drive.frame, integral=_sums(drive))
+    law = law if law.integral is None else law.prepared(parts.model, parts.graph)
     if isinstance(drive, Laws) and getattr(drive.leader, "reaction", None) is not None:
         drive = Laws(eqx.tree_at(lambda leader: leader.reaction, drive.leader, gain), law)
     return parts.replace(drive=drive.with_follower(law))
+
+
+def _sums(drive: Controller) -> Integral | None:
+    """Return the integral action of the followers' law; None of a law without any."""
+    return sums_of(drive.follower) if isinstance(drive, Laws) else None
 
 
 def _evaluate(gain: Gain, parts: Parts, settings: Settings, guarantee: Guarantee) -> Design:
@@ -258,7 +272,10 @@ def _evaluate(gain: Gain, parts: Parts, settings: Settings, guarantee: Guarantee
     (A, B), closed = loop.linear, loop.closed
     poles = np.linalg.eigvals(A - closed.strengths[:, None, None] * (B @ closed.K))
     design = Design(gain.method, gain, parts, guarantee, fastest=float(np.abs(poles).max()))
-    if not (loop.every and guarantee.linear):
+    costs = {cost.whose: cost for cost in sum_costs(parts, loop)}
+    if "followers" in costs:
+        design = design._replace(fastest=costs["followers"].fastest)
+    if not (loop.every and guarantee.linear or "followers" in costs and guarantee.decays):
         return design if guarantee.linear else design._replace(fastest=None)
     design, steps = design._replace(step=guarantee.longest_step(settings)), guarantee.steps
     factors = None if steps is None else gain_margin(steps)
@@ -314,6 +331,7 @@ def _changes(parts: Parts, settings: Settings) -> Iterator[str]:
         gain = synthesize(parts.model, parts.graph, InnerLoop())
     except EchelonError:
         return
-    drive = parts.drive.with_follower(Consensus(gain, law.feedforward, law.trim, law.frame))
+    changed = Consensus(gain, law.feedforward, law.trim, law.frame, integral=law.integral)
+    drive = parts.drive.with_follower(changed)
     if guarantee(parts.replace(drive=drive), settings).promised:
         yield '"follower.gain={method: inner-loop}"'

@@ -10,18 +10,8 @@ from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.sweeps.plan import Sweep, SweepRun
 from echelon.experiments.sweeps.sweep_dataset import SweepBatch, columns_of, numbers_of, refused
 from echelon.guarantees.promises.promise import Guarantee, promises
-from echelon.simulation.engine.batch import Batch, StepCount
+from echelon.simulation.engine.batch import FRAMES, Batch, StepCount, batch_size
 from echelon.simulation.engine.result import Result
-from echelon.simulation.native import is_installed
-
-_AGENT_STEPS, _MOST, _LEAST = 20_000_000, 2_500, 16
-"""Size of a batch: one or two seconds of native code, and at least one run for each vector lane."""
-_SLOWER = 20
-"""Factor by which JAX is slower than native code."""
-_NUMBERS = 32 * 2**20
-"""Most numbers of the frames in a batch, where frames are stored."""
-_FRAMES = 20
-"""Frames of a run checked for numbers that are not finite or exceed native code's range."""
 
 
 @final
@@ -32,12 +22,8 @@ class Workers:
         self.plan, self.runs = plan, Batch(threads)
         first = plan.first_built
         self._last: tuple[int, Experiment | str] = 0, first
-        settings, graph = first.settings, first.parts.graph
-        fast = settings.engine != "jax" and is_installed()
-        most, least = (_AGENT_STEPS, _LEAST) if fast else (_AGENT_STEPS // _SLOWER, 1)
-        numbers = 1 if plan.frames is None else plan.frames.numbers
-        most = min(_MOST, most // (settings.steps * graph.agents), _NUMBERS // numbers)
-        self.size = max(least if plan.frames is None else 1, most)
+        stored = None if plan.frames is None else plan.frames.numbers
+        self.size = batch_size(*first, stored)
 
     def batch(self, first: int, count: int, progress: StepCount) -> SweepBatch:
         """Return the numbers of some runs; `progress` is called several times a second.
@@ -76,7 +62,7 @@ class Workers:
             return case
         settings = case.settings
         settings = settings if run.seed is None else settings._replace(seed=run.seed)
-        every = self.plan.every or -(-settings.steps // _FRAMES)
+        every = self.plan.every or -(-settings.steps // FRAMES)
         return Experiment(case.parts, settings._replace(store_every=every))
 
 

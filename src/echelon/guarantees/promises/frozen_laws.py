@@ -25,8 +25,14 @@ from echelon.core.linear import matrix_exponential
 from echelon.core.types import Array, Input, State, States
 from echelon.core.words import Feedforward
 from echelon.guarantees.promises.closed_loop import LinearLoop, telling
+from echelon.guarantees.promises.integral_modes import (
+    gain_in_use,
+    gains_with_sums,
+    with_sums,
+)
 from echelon.guarantees.promises.leaders import Leaders, own_paths
-from echelon.laws.law import Faces, Feeds, Law, LocalView, gain_of, without_certificates
+from echelon.laws.integral_check import sums_of
+from echelon.laws.law import Faces, Feeds, Law, LocalView, without_certificates
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.settings import Settings
@@ -280,16 +286,18 @@ def frozen_of(
 ) -> FrozenLaws | None:
     """Return the laws of prepared parts frozen along the leader's path.
 
-    None without a path, and of a law that remembers something.
+    None without a path, and of a law that remembers something else than sums of errors.
     """
     assert isinstance(parts.drive, Laws)
-    if jax.tree.leaves(parts.drive.follower.init()):
+    follower = parts.drive.follower
+    if jax.tree.leaves(follower.init()) and sums_of(follower) is None:
         return None
     path = leader_run_of(parts, settings, leaders)
     if not len(path.times):
         return None
     along = _followers(parts, loop, path.rows)
-    frozen = FrozenLaws(path, along, _leader(parts, path.own_headings(parts), along))
+    own = _leader(parts, path.own_headings(parts), along, path.rates)
+    frozen = FrozenLaws(path, along, own)
     if not frozen.growth().lost:
         return frozen
     return frozen._replace(culprit=_culprit(parts, loop, path, frozen))
@@ -313,7 +321,9 @@ def _followers(parts: Parts, loop: LinearLoop, rows: PathSamples) -> ModeMatrice
         A = A - rows.rates[:, None, None] * state_turn(parts.model).slope
     values = loop.closed.eigenvalues
     few = values[telling(values, _MODES)]
-    return ModeMatrices(A, B, alone[:, None] + few[:, None, None] * felt[:, None])
+    felt = few[:, None, None] * gains_with_sums(law, felt)[:, None]
+    felt[..., : A.shape[1]] += alone[:, None]
+    return ModeMatrices(*with_sums(parts.model, law, A, B, rows.rates), felt)
 
 
 @cached_jit
@@ -342,17 +352,23 @@ def _about(
     return jax.vmap(one)(t, x, v, y)
 
 
-def _leader(parts: Parts, headings: Array, along: ModeMatrices) -> ModeMatrices | None:
+def _leader(
+    parts: Parts, headings: Array, along: ModeMatrices, rates: Array
+) -> ModeMatrices | None:
     assert isinstance(parts.drive, Laws)
-    model, gain = parts.model, gain_of(parts.drive.leader)
+    model, law = parts.model, parts.drive.leader
+    gain, n = gain_in_use(law), len(model.state_names)
     if gain is None:
         return None
-    S, P = np.asarray(model.input_scale, float), gain.P
+    # Without the followers' sums.
+    A, B = along.A[:, :n, :n], along.B[:, :n]
+    S, P, D = np.asarray(model.input_scale, float), gain.P, None
     if headings.any():
         D = matrix_exponential(headings[:, None, None] * state_turn(model).slope)
         P = D @ P @ np.swapaxes(D, 1, 2)
-    fed_back = gain.coupling * S @ gain.R_inverse @ S.T @ np.swapaxes(along.B, 1, 2) @ P
-    return along._replace(gains=fed_back[:, None])
+    fed_back = gain.coupling * S @ gain.R_inverse @ S.T @ np.swapaxes(B, 1, 2) @ P
+    fed_back = gains_with_sums(law, fed_back, D)[:, None]
+    return ModeMatrices(*with_sums(model, law, A, B, rates), fed_back)
 
 
 def _culprit(parts: Parts, loop: LinearLoop, path: LeaderRun, frozen: FrozenLaws) -> str:
@@ -363,7 +379,8 @@ def _culprit(parts: Parts, loop: LinearLoop, path: LeaderRun, frozen: FrozenLaws
     np.fill_diagonal(there, trim)
     here = PathSamples(*(np.repeat(part[k : k + 1], n, axis=0) for part in path.rows))
     slopes = _followers(parts, loop, here._replace(leaders=there, states=there))
-    leader = _leader(parts, np.repeat(path.own_headings(parts)[k], n), slopes)
+    there = np.repeat(path.own_headings(parts)[k], n), slopes, here.rates
+    leader = _leader(parts, *there)
     growth = slopes.growth() if leader is None else np.maximum(slopes.growth(), leader.growth())
     j = int(growth.argmin())
     return f"`{model.state_names[j]}` {about(path.states[k, j])} {model.state_units[j]}".rstrip()

@@ -21,6 +21,7 @@ from echelon.guarantees.promises.case import GuaranteeInputs
 from echelon.guarantees.promises.closed_loop import LinearLoop, grounded_slowest, loop_of
 from echelon.guarantees.promises.frozen_laws import frozen_of
 from echelon.guarantees.promises.hypotheses import hypotheses
+from echelon.guarantees.promises.integral_modes import longest_step_with_sums
 from echelon.guarantees.promises.leaders import leaders_of
 from echelon.guarantees.promises.limits_in_set import from_starts, held_line, limit_room
 from echelon.guarantees.promises.modes import slowest_in_turns, turns_in_words
@@ -232,7 +233,8 @@ class MetricPromise(Guarantee):
 
     def longest_step(self, settings: Settings) -> float:
         """Return the longest step (s) with which modes decay at the trim."""
-        return self.loop.longest_step(settings)
+        with_sums = longest_step_with_sums(self.case.parts, self.loop, settings)
+        return self.loop.longest_step(settings) if with_sums is None else with_sums
 
     def claim(self) -> Claim:
         """Return what is claimed near the trim, and what the region adds."""

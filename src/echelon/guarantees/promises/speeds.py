@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool
 
-from echelon.agents.models.heading_symmetry import state_turn
+from echelon.agents.models.linearization import Linearization
 from echelon.agents.models.model import ControlAffine, position_unit
 from echelon.agents.models.model_check import limited
 from echelon.agents.models.relative_equilibrium import (
@@ -30,7 +30,7 @@ from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array
 from echelon.core.words import Kind
 from echelon.guarantees.promises.case import GuaranteeInputs
-from echelon.laws.law import gain_of
+from echelon.guarantees.promises.integral_modes import slowest_in_axes
 from echelon.simulation.engine.law_drive import Laws
 from echelon.synthesis.gains.gain import Gain
 
@@ -75,15 +75,8 @@ class SteadyModes(NamedTuple):
 
 def slowest_about(case: GuaranteeInputs, x: Array, v: Array, rate: float = 0.0) -> float:
     """Return the slowest mode (1/s) about a state and a normalized input, in axes that turn."""
-    model, loop, gain = case.parts.model, case.loop, case.parts.drive.gain
-    assert isinstance(case.parts.drive, Laws) and isinstance(gain, Gain)
-    A, B = (np.asarray(part) for part in _slopes(model, jnp.asarray(x), jnp.asarray(v)))
-    A = A - rate * state_turn(model).slope
-    K = gain.R_inverse @ B.T @ gain.P
-    gains = [loop.inner + strength * K for strength in loop.closed.strengths]
-    own = gain_of(case.parts.drive.leader)
-    gains += [] if own is None else [own.coupling * own.R_inverse @ B.T @ own.P]
-    return float(np.linalg.eigvals(A - B @ np.array(gains)).real.max())
+    slopes = _slopes(case.parts.model, jnp.asarray(x), jnp.asarray(v))
+    return slowest_in_axes(case.parts, case.loop, Linearization(*map(np.asarray, slopes)), rate)
 
 
 @cached_jit

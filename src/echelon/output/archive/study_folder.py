@@ -1,6 +1,9 @@
 """The folders of sweeps and comparisons: runs as they are computed, then datasets and figures."""
 
+import csv
+import io
 import json
+import math
 import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, final
@@ -11,6 +14,7 @@ from echelon.core.types import JsonObject
 from echelon.experiments.results.dataset import save_dataset
 from echelon.experiments.scenario.scenario import SCENARIO_FILE, load_scenario
 from echelon.experiments.studies.compare import Comparison, ComparisonRow
+from echelon.experiments.studies.seed_comparison import NUMBERS, SeedComparison
 from echelon.experiments.sweeps.plan import Sweep, read_axes
 from echelon.experiments.sweeps.sweep_dataset import SweepBatch, axis_values, write_frames
 from echelon.output.archive.chunks import Chunks
@@ -154,9 +158,13 @@ class Flights:
 
 
 def write_comparison(
-    comparison: Comparison, summary: JsonObject, text: str, folder: Path, figures: bool = True
+    comparison: Comparison | SeedComparison,
+    summary: JsonObject,
+    text: str,
+    folder: Path,
+    figures: bool = True,
 ) -> None:
-    """Write the numbers of a comparison, its text and the figures.
+    """Write the numbers of a comparison, its text and the figures; over seeds also a table.
 
     Raises:
         OutputError: a file cannot be written.
@@ -165,8 +173,23 @@ def write_comparison(
         content = json.dumps(summary, indent=2, allow_nan=False)
         write_atomic(folder / "comparison.json", content + "\n")
         write_atomic(folder / "comparison.txt", text + "\n")
+        if isinstance(comparison, SeedComparison):
+            write_atomic(folder / RUNS / "seeds.csv", _table(comparison))
         if figures:
             # Here, since matplotlib takes long to load and only figures need it.
             from echelon.output.plots.study_figures import save_comparison_figures
 
             save_comparison_figures(comparison, folder)
+
+
+def _table(comparison: SeedComparison) -> str:
+    """Return the numbers of all runs as CSV, a run in each line; empty where one has none."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(["method", "seed", "outcome", *NUMBERS])
+    for row in comparison.rows:
+        columns = [row.numbers[name].tolist() for name in NUMBERS if row.numbers]
+        for seed, outcome, *numbers in zip(comparison.seeds, row.outcomes, *columns):
+            cells = ["" if math.isnan(number) else repr(number) for number in numbers]
+            table.writerow([row.label, seed, outcome, *cells])
+    return text.getvalue()

@@ -1,5 +1,6 @@
 """Figures of studies: of a comparison, of a sweep, and of a design."""
 
+import itertools
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +32,7 @@ from echelon.experiments.studies.basin import (
 )
 from echelon.experiments.studies.compare import PLANNED, PLANNED_LEADER, Comparison
 from echelon.experiments.studies.observed_region import ObservedRegion
+from echelon.experiments.studies.seed_comparison import SeedComparison, differences
 from echelon.experiments.sweeps.plan import SEED, SUMMARIZED
 from echelon.experiments.sweeps.sweep_dataset import share_bounds, succeeded
 from echelon.guarantees.promises.promise import guarantee
@@ -78,12 +80,15 @@ def comparison_figures(comparison: Comparison) -> "dict[str, Figure]":
     return {name: figure for name, figure in drawings.items() if figure is not None}
 
 
-def save_comparison_figures(comparison: Comparison, folder: Path) -> None:
+def save_comparison_figures(comparison: Comparison | SeedComparison, folder: Path) -> None:
     """Write each figure of a comparison as PNG and PDF under `folder`/figures.
 
     Raises:
         OSError: the folder or a file cannot be written.
     """
+    if isinstance(comparison, SeedComparison):
+        save(seed_figures(comparison), folder / "figures")
+        return
     save(comparison_figures(comparison), folder / "figures")
 
 
@@ -234,20 +239,38 @@ def _is_line(data: "xr.Dataset", key: str) -> bool:
 
 
 def _distributions(data: "xr.Dataset") -> "Figure":
-    figure, (axes,) = draw.sheet(2.8, 1, len(SUMMARIZED))
-    for ax, name in zip(axes, SUMMARIZED, strict=True):
-        values = np.sort(data[name].values.ravel())
-        values = values[np.isfinite(values)]
-        ax.set_xlabel(draw.label(RUN_NUMBERS[name].label, data[name].attrs.get("units", "")))
+    lines: dict[str, _Lines] = {}
+    for name in SUMMARIZED:
+        text = draw.label(RUN_NUMBERS[name].label, data[name].attrs.get("units", ""))
+        lines[text] = {"": data[name].values.ravel()}
+    return _shares(lines, data["outcome"].size, "runs")
+
+
+_Lines = dict[str, Array]
+"""Numbers of runs by the label of their line; those that are not finite exceed all others."""
+
+
+def _shares(lines: dict[str, _Lines], total: int, of: str, signed: bool = False) -> "Figure":
+    """Return on which share of `total` runs a number stays below each value, by its name."""
+    figure, (axes,) = draw.sheet(2.8, 1, len(lines))
+    for ax, (text, curves) in zip(axes, lines.items(), strict=True):
+        ax.set_xlabel(text)
         ax.set_ylim(0.0, 1.02)
-        if not values.size:
-            continue
-        # A share of all runs: those without the number count as above any value.
-        share = np.arange(1, len(values) + 1) / data["outcome"].size
-        keep = draw.thin(len(values))
-        ax.step(values[keep], share[keep], where="post", color=draw.COLOURS[0])
-        _scale(ax, "x", values)
-    axes[0].set_ylabel("share of runs below")
+        for k, (label, numbers) in enumerate(curves.items()):
+            values = np.sort(numbers)
+            # A share of all runs: those without the number count as above any value.
+            share = np.arange(1, len(values) + 1)[np.isfinite(values)] / total
+            values = values[np.isfinite(values)]
+            keep = draw.thin(len(values))
+            look = draw.pen(k, draw.NAMED)
+            ax.step(values[keep], share[keep], where="post", label=label, **look)
+        finite = np.concatenate([*curves.values()])
+        finite = finite[np.isfinite(finite)]
+        if signed:
+            ax.axvline(0.0, **draw.MARK)
+        elif finite.size:
+            _scale(ax, "x", finite)
+    axes[0].set_ylabel(f"share of {of} below")
     return draw.finish(figure)
 
 
@@ -337,6 +360,32 @@ def _cell_ends(values: Array) -> Array:
     first, last = 1.5 * places[0] - 0.5 * places[1], 1.5 * places[-1] - 0.5 * places[-2]
     ends = np.concatenate([[first], between, [last]])
     return np.exp(ends) if _is_geometric(values) else ends
+
+
+# ---- comparisons over seeds --------------------------------------------------------------------
+
+
+def seed_figures(comparison: SeedComparison) -> "dict[str, Figure]":
+    """Return the figures of a comparison over seeds, by name.
+
+    `quantiles` shows on which share of the seeds each method stays below a number, `differences`
+    on which share the number of a method minus that of another does: left of 0 the first is better.
+    """
+    rows, total = comparison.compared, len(comparison.seeds)
+    names = [name for name in SUMMARIZED if name in comparison.names]
+    pairs = [*itertools.combinations(rows, 2)][: len(draw.COLOURS)]
+    single, double = dict[str, _Lines](), dict[str, _Lines]()
+    for name in names:
+        text, unit = RUN_NUMBERS[name].label, comparison.unit(name)
+        single[draw.label(text, unit)] = {row.label: row.ranked(name) for row in rows}
+        double[draw.label(f"{text}, difference", unit)] = {
+            f"{a.label} minus {b.label}": differences(name, a, b) for a, b in pairs
+        }
+    with draw.style():
+        figures = {"quantiles": _shares(single, total, "seeds")} if names else {}
+        if names and pairs:
+            figures["differences"] = _shares(double, total, "seeds", signed=True)
+    return figures
 
 
 # ---- designs ----------------------------------------------------------------------------------

@@ -19,9 +19,11 @@ from echelon.experiments.results.run_numbers import (
 )
 from echelon.experiments.results.table_two import PRINTED, is_papers_experiment, table_two
 from echelon.experiments.studies.compare import LABELS, Comparison, ComparisonRow
+from echelon.experiments.studies.seed_comparison import SeedComparison
 from echelon.guarantees.promises.promise import Guarantee
 from echelon.output.reports.beside_paper import print_beside_paper, remarks
 from echelon.output.reports.run_report import say
+from echelon.output.reports.seed_report import print_seeds, seed_mapping
 from echelon.simulation.engine.result import Result
 
 if TYPE_CHECKING:
@@ -37,7 +39,7 @@ _ALIKE = 1.5
 """Computing times within this factor count as equal: the machine is shared."""
 
 
-def comparison_report(comparison: Comparison, width: int = 200) -> str:
+def comparison_report(comparison: Comparison | SeedComparison, width: int = 200) -> str:
     """Return a comparison as plain text."""
     from rich.console import Console
 
@@ -47,8 +49,11 @@ def comparison_report(comparison: Comparison, width: int = 200) -> str:
     return text.getvalue().rstrip("\n")
 
 
-def print_comparison(console: "Console", comparison: Comparison) -> None:
-    """Print a comparison on a rich console: two tables, remarks, and the verdict."""
+def print_comparison(console: "Console", comparison: Comparison | SeedComparison) -> None:
+    """Print a comparison on a rich console: tables, remarks, and the verdict on one seed."""
+    if isinstance(comparison, SeedComparison):
+        print_seeds(console, comparison)
+        return
     runs = _papers_runs(comparison)
     if runs:
         print_beside_paper(console, runs, comparison.scenario)
@@ -278,8 +283,10 @@ def _listed(labels: Sequence[str]) -> str:
 # ---- data ---------------------------------------------------------------------------------------
 
 
-def comparison_mapping(comparison: Comparison) -> JsonObject:
+def comparison_mapping(comparison: Comparison | SeedComparison) -> JsonObject:
     """Return a comparison ready for JSON; missing numbers are None."""
+    if isinstance(comparison, SeedComparison):
+        return seed_mapping(comparison)
     papers = _papers_runs(comparison)
     return {
         "scenario": comparison.scenario,

@@ -25,6 +25,7 @@ from echelon.simulation.engine.prepare import Prepared, channel_of, prepare, sen
 from echelon.simulation.engine.record import Recorder
 from echelon.simulation.engine.result import Result
 from echelon.simulation.engine.simulate import result_of, sample_reference, simulate
+from echelon.simulation.native import is_installed
 from echelon.simulation.native.stepper import NativeStepper
 from echelon.simulation.native.threads import processors
 from echelon.simulation.native.varying import ProgramKeys
@@ -39,6 +40,22 @@ StepCount: TypeAlias = Callable[[int, int], None]
 """Called with the steps that were taken, and those of the run."""
 _SMALL = 64
 """Agents of a formation that is stepped with others even if they do not fill a vector."""
+_AGENT_STEPS, _MOST, _LEAST = 20_000_000, 2_500, 16
+"""Size of a batch: one or two seconds of native code, and at least one run for each vector lane."""
+_SLOWER = 20
+"""Factor by which JAX is slower than native code."""
+_NUMBERS = 32 * 2**20
+"""Most numbers of the frames in a batch, where frames are stored."""
+FRAMES = 20
+"""Frames of a run checked for numbers that are not finite or exceed native code's range."""
+
+
+def batch_size(parts: Parts, settings: Settings, stored: int | None = None) -> int:
+    """Return how many runs to step together; `stored` is how many numbers each run stores."""
+    fast = settings.engine != "jax" and is_installed()
+    most, least = (_AGENT_STEPS, _LEAST) if fast else (_AGENT_STEPS // _SLOWER, 1)
+    most = min(_MOST, most // (settings.steps * parts.graph.agents), _NUMBERS // (stored or 1))
+    return max(least if stored is None else 1, most)
 
 
 class _SharedRun(NamedTuple):

@@ -23,6 +23,7 @@ from echelon.core.types import Array, Scalar, State
 from echelon.core.words import Feedforward, Frame, MessageContent, Prediction
 from echelon.laws.flat_law import FlatLaw
 from echelon.laws.flat_loop import FlatMemory
+from echelon.laws.integral_check import check_sums
 from echelon.laws.law import Checks, Faces, Law, Proves, Speaks, Travels, gain_of
 from echelon.laws.law_check import (
     check_signals,
@@ -117,6 +118,7 @@ class Laws(Controller):
         """
         leader, follower = (prepare_law(law, model, graph) for law in (self.leader, self.follower))
         follower = Checks.of(follower).following(leader, model)
+        check_sums(leader, follower, model)
         with precision("float64"):
             check_signals(leader, follower, model)
         drive = Laws(leader, follower)

@@ -33,6 +33,7 @@ from echelon.simulation.scalars import (
 from echelon.simulation.step.alone import one_row
 from echelon.simulation.step.leadership import NOBODY, FixedLeaders
 from echelon.simulation.step.loop import IdealNetwork, Loop
+from echelon.simulation.step.meter import ALWAYS
 from echelon.simulation.step.networks import LateNetwork, LeaderwardNeighbours
 from echelon.simulation.step.own_members import own_members
 from echelon.simulation.step.places import MovingPlaces
@@ -44,13 +45,16 @@ from echelon.simulation.step.records import (
     LeaderPackets,
     LeaderSpeech,
     LoopState,
+    Mask,
     Messages,
     NetworkEstimate,
     Own,
     Steps,
+    choose,
 )
-from echelon.simulation.step.roster import Links
-from echelon.simulation.step.sequence import act, begin, hear, saying
+from echelon.simulation.step.roster import Everybody, JoiningAgents, Links
+from echelon.simulation.step.run_laws import has_angles
+from echelon.simulation.step.sequence import act, begin, hear, held, saying
 from echelon.simulation.step.turns import by_depth
 
 # ---- what native code cannot step ----------------------------------------------------------------
@@ -71,11 +75,12 @@ def check_loop(loop: Loop) -> None:
 
 
 def check_distances(loop: Loop) -> None:
-    """Raise `Unsupported` if agents keep distances, come or go, or have backup leaders."""
-    changes = loop.roster.changes or loop.laws.backups
+    """Raise `Unsupported` if agents need others' hulls, headings, or who leads in the same step."""
+    joins = isinstance(loop.roster, JoiningAgents) and has_angles(loop.laws.follower)
     for fault, text in (
         (loop.surroundings.keeps_apart, "agents that keep away from each other"),
-        (changes, "agents that are lost, join or take the lead"),
+        (joins, "agents that join and take over how often others turned"),
+        (loop.laws.backups and not loop.network.late, "backup leaders in the ideal network"),
     ):
         if fault:
             raise Unsupported(text)
@@ -99,6 +104,8 @@ class BlockRows(NamedTuple):
         message: what it sends besides its state.
         input: that is applied (m,).
         varying: numbers of its law and model that differ between formations.
+        here: whether it is there, where some come or go.
+        lead: 1 while it leads, 2 where it takes the lead, where backup leaders do.
         errors, tracking: as in `Sums`, but of the steps before the steady window and in it.
         effort, limited, unsettled, inside, chatter, outputs: as in `Sums`.
         peak: minus the largest squared error since the last event; empty without events.
@@ -117,6 +124,8 @@ class BlockRows(NamedTuple):
     message: range
     input: range
     varying: range
+    here: range
+    lead: range
     errors: range
     effort: range
     limited: range
@@ -141,6 +150,7 @@ class BlockRows(NamedTuple):
         late = letter_sizes(loop)
         sizes += [sum(sensed_sizes(loop)) * listens_first(loop)]
         sizes += [0 if late is None else late.packet + 1, m, forward_size(loop), m, varying]
+        sizes += [loop.roster.changes, loop.laws.backups]
         sizes += [2, 1, 1, 1, len(loop.meter.charted), 1]
         sizes += [min(1, len(loop.meter.events)), *[loop.meter.extremes] * 2]
         sizes += [2, len(loop.model.output_names), 1]
@@ -263,6 +273,17 @@ Entries: TypeAlias = Any
 
 
 @final
+class _Present(Everybody):
+    """Whether one agent is there, as it is given."""
+
+    present: Any
+
+    def here(self, step: jax.Array) -> Mask:
+        """Return it."""
+        return self.present
+
+
+@final
 class _Hears(IdealNetwork):
     """What one agent hears, as it is given."""
 
@@ -278,13 +299,16 @@ class _Reads(LateNetwork):
     """What one agent makes of the newest packet, from which it knows of a leader."""
 
     packet: Any
+    # Which of the rows take the lead.
+    elected: Any
 
     def receive(self, loop: Loop, memory: PyTree, known: Known) -> tuple[NetworkEstimate, PyTree]:
         """Return it; what neighbours say is added up elsewhere."""
         nobody = jnp.zeros(1, jnp.int32)
         mail = self.rules.begin(nobody, 0, known.said, self.packet.content.shape[1])
         own = known.own._replace(number=nobody)
-        mail = mail._replace(packet=self.packet)
+        stamp = jnp.where(self.elected, known.clock.now, self.packet.stamp)
+        mail = mail._replace(packet=self.packet._replace(stamp=stamp))
         return self.rules.read(loop, mail, known._replace(own=own)), memory
 
 
@@ -312,19 +336,24 @@ class _Writes(LateNetwork):
 
 def _network_of(loop: Loop, leads: bool, inputs: "StepInputs", acts: bool) -> IdealNetwork:
     """Return the network of one agent that hears what is given, before it acts or as it does."""
-    z, first, late = inputs.z[None], _first(leads), letter_sizes(loop)
+    z, late, elected = inputs.z[None], letter_sizes(loop), np.array([False])
+    leading: Any = np.array([leads])
+    if inputs.lead is not None:
+        leading, elected = inputs.lead > 0.0, inputs.lead > 1.0
+    first = FixedLeaders(leading)
     if late is None:
-        return _Hears(first, NetworkEstimate(z, jnp.array([leads]), inputs.message[None]))
+        return _Hears(first, NetworkEstimate(z, jnp.asarray(leading), inputs.message[None]))
     rules = dataclasses.replace(late.network.rules, leadership=first)
     # Whom it follows: itself or another one.
-    leader = jnp.array([0 if leads else NOBODY])
+    leader = jnp.where(jnp.asarray(leading), 0, NOBODY)
     content, stamp = inputs.packet[None, :-1], inputs.packet[-1:]
     packet = LeaderPackets(leader, stamp, content, ())
     if not acts:
-        return _Reads(first, rules, late.network.medium, packet)
+        return _Reads(first, rules, late.network.medium, packet, elected)
     _, _, expected, forward, _ = _parts(loop, inputs.sensed)
     hops = jnp.zeros(1, jnp.int32)
-    heard = NetworkEstimate(z, jnp.array([leads]), forward[None], expected[None], hops, packet)
+    rows = forward[None], expected[None], hops, packet
+    heard = NetworkEstimate(z, jnp.asarray(leading), *rows)
     return _Writes(first, rules, late.network.medium, packet, heard)
 
 
@@ -360,9 +389,11 @@ class StepInputs(NamedTuple):
         sensed: what it knows of its state, and what it says, where that is known before it acts.
         z: what it hears of its neighbours.
         message: what it is sent.
-        leader: its leader's state less its offset; None of a leader.
+        leader: its leader's state less its offset; None of a leader that always leads.
         previous_cut: as in `LoopState`.
         packet: the newest of a leader.
+        here: whether it is there, a truth; None where all always are.
+        lead: as in `BlockRows`; None where that never changes.
     """
 
     step: Entries
@@ -377,6 +408,8 @@ class StepInputs(NamedTuple):
     leader: Entries
     previous_cut: Entries
     packet: Entries
+    here: Entries
+    lead: Entries
 
 
 Outputs: TypeAlias = dict[str, Entries]
@@ -398,8 +431,10 @@ def prior_step(own: Loop, inputs: StepInputs) -> Outputs:
     goal = _goal(own, clock, inputs)
     goals = goal[np.array(own.meter.measured[: len(shown_goals(own))], int)]
     heard, said = known.heard, known.said[0]
-    sensed = [known.own.x[0], said]
+    sensed, packet = [known.own.x[0], said], inputs.packet
+    sensing = choose(known.here, sensing, inputs.memory.sensing)
     if own.network.late:
+        packet = jnp.append(heard.packet.content[0], heard.packet.stamp)
         knows = heard.leads | (clock.age(heard.packet.stamp) < jnp.inf)
         # What leaders receive of others' inputs is not used.
         forward = jnp.where(heard.leads, 0.0, heard.feedforward[0])
@@ -407,6 +442,7 @@ def prior_step(own: Loop, inputs: StepInputs) -> Outputs:
     return {
         "memory": _flat(inputs.memory._replace(sensing=sensing)),
         "sensed": jnp.concatenate(sensed),
+        "packet": packet,
         "mirror": jnp.concatenate([inputs.x - goal, goals, *[said] * (not own.network.late)]),
     }
 
@@ -424,7 +460,8 @@ def _acted(own: Loop, now: LoopState, clock: Steps, inputs: StepInputs) -> tuple
         x, said = (part[None] for part in _parts(own, inputs.sensed)[:2])
         offsets = own.places.groups(own.model, own.laws, clock.t)
         mine = Own(jnp.asarray(own.laws.numbers), x)
-        known = Known(clock, True, mine, offsets, said, own.graph.exchange)
+        here = own.roster.here(clock.step)
+        known = Known(clock, here, mine, offsets, said, own.graph.exchange)
         heard, network = own.network.receive(own, (), known)
         known, sensing = known._replace(heard=heard), now.memory.sensing
     return act(own, now, known, sensing, network), known
@@ -444,7 +481,9 @@ def agent_step(own: Loop, inputs: StepInputs) -> Outputs:
         tracking, outputs = meter.of_leader(inputs.steady, x, goal, inputs.reference)
     plant = now.memory.plant, now.states, acted.inputs, inputs.step, known.own.number
     states, plant = own.motion.advance(*plant)
-    memory = acted.memory._replace(plant=plant)
+    after = LoopState(inputs.step, states, acted.cut, acted.memory._replace(plant=plant))
+    after = held(own, known.here, after, now)
+    states, memory = after.states, after.memory
     mirrors = dict[str, jax.Array]()
     if inputs.sensed is None:
         later = Steps(inputs.step + 1, own.motion.dt)
@@ -454,16 +493,11 @@ def agent_step(own: Loop, inputs: StepInputs) -> Outputs:
     elif own.network.late:
         _, said, expected, _, knows = _parts(own, inputs.sensed)
         mirrors["mirror_before"] = jnp.concatenate([said, expected, knows])
-        mirrors["letter"] = _flat(memory.network)
+        mirrors["letter"] = _flat(acted.memory.network)
     else:
         goals = jnp.zeros(len(shown_goals(own)))
         mirrors["mirror_before"] = jnp.concatenate([x - goal, goals, known.said[0]])
-    return mirrors | {
-        "state": states[0],
-        "memory": _flat(memory._replace(network=())),
-        "cut": cut,
-        "message": acted.message[0],
-        "input": u,
+    sums = {
         "errors": metered.errors,
         "tracking": tracking,
         "outputs": outputs,
@@ -471,9 +505,25 @@ def agent_step(own: Loop, inputs: StepInputs) -> Outputs:
         "limited": jnp.where(acted.limited, 1.0, 0.0),
         "unsettled": metered.unsettled[None],
         "inside": metered.inside,
-        "deviation": metered.deviation,
+        **dict.fromkeys(("lowest", "highest"), metered.deviation),
         "chatter": jnp.where((cut * inputs.previous_cut < 0.0).any(), 1.0, 0.0)[None],
     }
+    nothing = {name: jnp.full_like(x, _NOTHING.get(name, 0.0)) for name, x in sums.items()}
+    return (
+        mirrors
+        | choose(known.here, sums, nothing)
+        | {
+            "state": states[0],
+            "memory": _flat(memory._replace(network=())),
+            "cut": after.cut[0],
+            "message": acted.message[0],
+            "input": u,
+        }
+    )
+
+
+_NOTHING = {"unsettled": -1.0, "inside": ALWAYS, "lowest": np.inf, "highest": -np.inf}
+"""What an agent that is absent adds to sums, where it is not 0."""
 
 
 def _shown(own: Loop, y: jax.Array, said: jax.Array) -> jax.Array:
@@ -524,7 +574,9 @@ def program_of(
         ) -> list[jax.Array]:
             own = varying.filled(leaves, keys)
             network = _network_of(own, leads, inputs, step is agent_step)
-            results.update(step(_of_one(own, leads, number, inputs.rows, network), inputs))
+            own = _of_one(own, leads, number, inputs.rows, network)
+            present = _Present(True if inputs.here is None else inputs.here)
+            results.update(step(own.replace(roster=present), inputs))
             return [results[name] for name in sorted(results)]
 
         results = Outputs()
@@ -535,8 +587,8 @@ def program_of(
     prior = None
     if len(rows.sensed):
         mine = traced(prior_step, inputs._replace(sensed=None))
-        prior = Body(stores=_placed(rows, mine, ("memory", "sensed")), mirror=mine["mirror"])
-        prior = _finished(graph, prior)
+        stores = _placed(rows, mine, ("memory", "sensed", "packet"))
+        prior = _finished(graph, Body(stores=stores, mirror=mine["mirror"]))
     body = _body(loop, graph, rows, inputs, traced(agent_step, inputs), leads, leads and follows)
     return Program(_finished(graph, body), prior, given)
 
@@ -575,8 +627,8 @@ def _body(
         tracking = _before_and_in_window(inputs, outputs["tracking"])
         sums |= {"tracking": tracking, "outputs": outputs["outputs"]}
     # Rows of the smallest numbers serve for the largest too.
-    minima = {"inside": outputs["inside"], "lowest": outputs["deviation"]}
-    largest = {"peak": outputs["errors"][: len(rows.peak)], "highest": outputs["deviation"]}
+    minima = {"inside": outputs["inside"], "lowest": outputs["lowest"]}
+    largest = {"peak": outputs["errors"][: len(rows.peak)], "highest": outputs["highest"]}
     minima |= {name: [graph.make("sub", 0.0, x) for x in part] for name, part in largest.items()}
     return Body(
         stores=stores,
@@ -646,6 +698,8 @@ def _step_inputs(
         return leaves_of(graph, "row", places)
 
     x, offset, memory = row(rows.state), row(rows.offset), memory_of(loop, leads)
+    here = [graph.make("ne", leaf, 0.0) for leaf in row(rows.here)]
+    changes = loop.laws.backups
     shown = said_size(loop) if loop.network.late else n + shown_size(loop)
     # A truth and not a number, since it chooses between sums.
     late = graph.make("ne", graph.leaf("steady", uniform=True), 0.0)
@@ -666,9 +720,11 @@ def _step_inputs(
         message=np.zeros(len(rows.message))
         if leads
         else leaves_of(graph, "message", range(len(rows.message))),
-        leader=None if leads else leaves_of(graph, "leader", range(n)),
+        leader=None if leads and not changes else leaves_of(graph, "leader", range(n)),
         previous_cut=row(rows.cut),
         packet=row(rows.packet),
+        here=np.array(here, object) if here else None,
+        lead=row(rows.lead) if leads and changes else None,
     )
 
 

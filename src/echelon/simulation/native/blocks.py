@@ -121,6 +121,14 @@ class Places(abc.ABC):
         """Return where agents read each other: `width` numbers each, and messages in `rows`."""
 
     @abc.abstractmethod
+    def leaders_of(self, nearest: Array, width: int) -> Array:
+        """Return where the leader of each agent is, by its number (N,), in a mirror of a width."""
+
+    @abc.abstractmethod
+    def of_edges(self, values: Array) -> Array:
+        """Return values (E,) of edges where their sums are, unless NumPy repeats them."""
+
+    @abc.abstractmethod
     def spacing(self, edges: Array) -> Array:
         """Return the sums in rows of edges, one for each edge."""
 
@@ -197,17 +205,26 @@ class SwarmBlocks(Places):
         far = 1 if self.row_major else stride(width, lanes)
         starts, positions, weights = self.slots
         sources = self.position[_senders_of(loop)[self.agents]]
-        nearest = np.asarray(loop.meter.nearest)[self.agents]
         return Neighbourhood(
             starts,
             np.ascontiguousarray(positions * far, np.int32),
             _aligned_copy(weights, dtype),
             ((sources // lanes) * rows * lanes + sources % lanes).astype(np.int32),
-            (self.position[nearest] * far).astype(np.int32),
+            self.leaders_of(np.asarray(loop.meter.nearest), width),
             *edge_blocks(loop, self, dtype, far),
             self.contiguous,
             self.contiguous_edges,
         )
+
+    def leaders_of(self, nearest: Array, width: int) -> Array:
+        """Return where the leader of each agent is."""
+        far = 1 if self.row_major else stride(width, self.lanes)
+        return (self.position[nearest[self.agents]] * far).astype(np.int32)
+
+    def of_edges(self, values: Array) -> Array:
+        """Return values (E,) of edges where their sums are, (edge blocks, lanes)."""
+        ordered = np.resize(values[self.edge_order], self.edge_blocks * self.lanes)
+        return ordered.reshape(-1, self.lanes)
 
     def edge_ends(self) -> Array:
         """Return the positions of the ends of edges, (2 edge blocks, lanes)."""
@@ -265,12 +282,21 @@ class FormationBlocks(Places):
             (positions * far).astype(np.int32),
             _aligned_copy(np.broadcast_to(weights, (*weights.shape[:2], lanes)), dtype),
             (place[_senders_of(loop)[self.swarm.agents]] * rows * lanes).astype(np.int32),
-            (place[np.asarray(loop.meter.nearest)[self.swarm.agents]] * far).astype(np.int32),
+            self.leaders_of(np.asarray(loop.meter.nearest), width),
             self._edges(dtype),
             np.ascontiguousarray(ends, np.int32),
             np.zeros(1, np.int8),
             np.zeros(1, np.int8),
         )
+
+    def leaders_of(self, nearest: Array, width: int) -> Array:
+        """Return where the leader of each agent is."""
+        places = self.swarm.position[nearest[self.swarm.agents]]
+        return (places * width * self.lanes).astype(np.int32)
+
+    def of_edges(self, values: Array) -> Array:
+        """Return values (E,) of edges where their sums are, (E, 1)."""
+        return values[:, None]
 
     def _edges(self, dtype: np.dtype) -> Array:
         """Return the rows of the edges, (groups, E, q + 2, lanes)."""

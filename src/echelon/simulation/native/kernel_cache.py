@@ -80,7 +80,7 @@ def plan_of(
         Unsupported: there is no native code for them.
     """
     loop, tracks = varying.loop, follows(varying.loop)
-    n, one_leader = len(rows.state), len(loop.laws.leaders) == 1
+    n, one_leader = len(rows.state), len(loop.meter.leaders) == 1
     first, others = (program_of(varying, bits, rows, leads, tracks) for leads in (True, False))
     bodies = (first.body, others.body)
     if batched:

@@ -19,7 +19,8 @@ from echelon.simulation.step.records import Messages
 
 _AHEAD, _AT_ONCE = 64, 4_000_000
 """Steps that are decided at once, and numbers of them at most."""
-_Step: TypeAlias = Callable[[Empty, jax.Array], tuple[Empty, tuple[jax.Array, jax.Array]]]
+_Decided: TypeAlias = tuple[jax.Array, jax.Array, jax.Array]
+_Step: TypeAlias = Callable[[Empty, jax.Array], tuple[Empty, _Decided]]
 
 
 @final
@@ -77,18 +78,18 @@ class MailTable:
     def forget(self, loops: Sequence[Loop]) -> None:
         """Continue with loops that may have other numbers."""
         loop = loops[0]
-        radio = Radio(loop.network, loop.graph, loop.roster, np.asarray(loop.motion.dt))  # type: ignore[arg-type]
-        flat = [jax.tree.leaves(each.network) for each in loops]
-        tree = jax.tree.structure(loop.network)
+        flat = [jax.tree.leaves((each.network, each.roster)) for each in loops]
+        tree = jax.tree.structure((loop.network, loop.roster))
         # What differs, such as keys, has an axis of formations.
         differs = [len({np.asarray(x).tobytes() for x in leaves}) > 1 for leaves in zip(*flat)]
         stacked = [
             np.stack([np.asarray(x) for x in leaves]) if own else leaves[0]
             for own, leaves in zip(differs, zip(*flat, strict=True), strict=True)
         ]
-        self.radio = radio._replace(network=tree.unflatten(stacked))
-        axes = tree.unflatten([0 if own else None for own in differs])
-        self.axes = Radio(axes, None, None, None)  # type: ignore[arg-type]
+        network, roster = tree.unflatten(stacked)
+        self.radio = Radio(network, loop.graph, roster, np.asarray(loop.motion.dt))
+        network, roster = tree.unflatten([0 if own else None for own in differs])
+        self.axes = Radio(network, None, roster, None)  # type: ignore[arg-type]
 
     # ---- what is decided ----
 
@@ -98,10 +99,18 @@ class MailTable:
         return jax.tree.map(lambda leaf: np.repeat(leaf[None], self.count, axis=0), one)
 
     def left(self, step: int) -> int:
-        """Return for how many steps from one on it is decided what arrives."""
+        """Return for how many steps from one on it is decided what arrives, with the same leaders.
+
+        An agent takes the lead in one step.
+        """
         if step >= self.until:
             self._decide(step)
-        return self.until - step
+        later = self.changes[self.changes > step]
+        return int(later[0] if len(later) else self.until) - step
+
+    def leading(self, step: int) -> Array:
+        """Return of each agent that may lead whether it does, (F N, k), as `BlockRows.lead`."""
+        return self.leads[:, step - self.first].reshape(self.count * self.loop.agents, -1)
 
     def _decide(self, step: int) -> None:
         # What is in flight at the first step is kept, so that a moment can be had at any later one.
@@ -109,7 +118,9 @@ class MailTable:
         far = self.blocks * self.letters.size * self.lanes
         numbers = np.asarray(step, np.int32), self.place, np.asarray(far, np.int32)
         self.after, decided = _decided(self.radio, self.axes, self.now, *numbers, self.ahead)
-        links, packets = (np.asarray(part).swapaxes(0, 1) for part in decided)
+        links, packets, self.leads = (np.asarray(part).swapaxes(0, 1) for part in decided)
+        changed = (np.diff(self.leads, axis=1) != 0).any(axis=(0, 2))
+        self.changes = step + 1 + np.flatnonzero(changed)
         slots = len(self.slots)
         self.arrivals[:, :, :slots] = self._placed(links, self.slots)
         agents = self.one.agents.reshape(self.blocks, -1)
@@ -212,11 +223,12 @@ def _decided(
     place: jax.Array,
     row: jax.Array,
     steps: int,
-) -> tuple[Empty, tuple[jax.Array, jax.Array]]:
+) -> tuple[Empty, _Decided]:
     """Return the messages after some steps, which come by each link, and which bring newer packets.
 
-    The last two are places in the ring, (T, F, K) and (T, F, N), and -1 for none. An agent's letter
-    is at its `place` in a row, of so many numbers.
+    These two are places in the ring, (T, F, K) and (T, F, N), and -1 for none. An agent's letter
+    is at its `place` in a row, of so many numbers. The last is who leads, (T, F, N), as
+    `BlockRows.lead`, if anybody takes the lead.
     """
     one = _step(radio, axes, place, row)
     return jax.lax.scan(one, now, first + jnp.arange(steps, dtype=jnp.int32))
@@ -231,22 +243,25 @@ def _passed(radio: Radio, axes: PyTree, now: Empty, first: jax.Array, count: jax
 
 def _step(radio: Radio, axes: PyTree, place: jax.Array, row: jax.Array) -> _Step:
     """Return what takes a step of all formations, with what comes."""
-    senders, medium = jnp.asarray(radio.links.exchange.senders), radio.network.medium  # type: ignore[attr-defined]
+    senders, medium = jnp.asarray(radio.links.exchange.senders), radio.network.medium
+    changes = radio.network.leadership.changes
 
-    def one(radio: Radio, now: Empty, step: jax.Array) -> tuple[Empty, tuple[jax.Array, jax.Array]]:
+    def one(radio: Radio, now: Empty, step: jax.Array) -> tuple[Empty, _Decided]:
+        led = now.mail.packet.leader == jnp.arange(len(place))
         now, decided = deliver(radio, now, step)
         letter = decided.slot.astype(jnp.int32) * row + place[senders]
         by = decided.place.astype(jnp.int32)
         packet = jnp.where(by >= 0, letter[by], -1)
-        return now, (jnp.where(decided.new, letter, -1), packet)
+        leads = jnp.where(decided.leads, 2 - led, 0).astype(jnp.int32)[: len(place) * changes]
+        return now, (jnp.where(decided.new, letter, -1), packet, leads)
 
-    def all_(now: Empty, step: jax.Array) -> tuple[Empty, tuple[jax.Array, jax.Array]]:
-        count = len(now.mail.stamp)
-        nothing = tuple(jnp.full((count, k), -1, jnp.int32) for k in (len(senders), len(place)))
+    def all_(now: Empty, step: jax.Array) -> tuple[Empty, _Decided]:
+        count, sizes = len(now.mail.stamp), (len(senders), len(place), len(place) * changes)
+        nothing = tuple(jnp.full((count, k), -1, jnp.int32) for k in sizes)
         # Where nothing arrives and nothing is sent, time alone changes nothing, as long as nobody
         # takes the lead.
         busy = step % jnp.max(jnp.asarray(medium.every)) == 0
-        busy |= (now.in_flight.arrival == step).any() | radio.network.leadership.changes
+        busy |= (now.in_flight.arrival == step).any() | changes
         many = jax.vmap(one, (axes, 0, None))
         return jax.lax.cond(busy, lambda: many(radio, now, step), lambda: (now, nothing))
 

@@ -38,21 +38,37 @@ class PairWatch:
         self.tape = aligned((self.steps, places.blocks, axes, places.lanes), dtype)
         self.position, self.formations = places.position, formations
         agents = len(places.position) // formations if watched else 0
-        self.pairs = np.triu_indices(agents, 1)
         # Where vectors hold many formations, the kernel compares the few pairs of each.
-        count, kernel = len(self.pairs[0]), places.batched and watched > 0
-        shape = places.groups, count * kernel, 2, places.lanes
-        self.least = aligned(shape, dtype)
-        block = places.swarm.position if isinstance(places, FormationBlocks) else places.position
-        ends = np.stack([block[end] for end in self.pairs], axis=1) * rows * places.lanes
-        self.ends = np.ascontiguousarray(ends, np.int32)
+        self.kernel = places.batched and watched > 0
+        self.block = (places.swarm if isinstance(places, FormationBlocks) else places).position
+        self.shape, self.far = (places.groups, 2, places.lanes), rows * places.lanes
+        self._pair(np.ones(agents, bool))
+        self.count = formations if self.tape.size or self.least.size else 0
         self.clear()
+
+    def _pair(self, here: Array) -> None:
+        i, j = np.triu_indices(len(here), 1)
+        self.here, self.pairs = here, (i[here[i] & here[j]], j[here[i] & here[j]])
+        groups, *rest = self.shape
+        self.least = aligned((groups, len(self.pairs[0]) * self.kernel, *rest), self.tape.dtype)
+        ends = np.stack([self.block[end] for end in self.pairs], axis=1) * self.far
+        self.ends = np.ascontiguousarray(ends, np.int32)
+
+    def among(self, here: Array) -> None:
+        """Compare from now on the agents that are there (N,) alone."""
+        if self.count and not np.array_equal(here, self.here):
+            self._find()
+            self._pair(here)
+            self._forget()
+
+    def _forget(self) -> None:
+        self.least[:, :, 0], self.least[:, :, 1] = np.inf, 0.0
+        self.used, self.first = 0, 0
 
     def clear(self) -> None:
         """Forget all steps."""
-        count = self.formations if self.tape.size or self.least.size else 0
-        self.least[:, :, 0], self.least[:, :, 1] = np.inf, 0.0
-        self.used, self.first = 0, 0
+        count = self.count
+        self._forget()
         self.closest, self.met = np.full(count, np.inf), np.zeros((count, 3))
 
     def room(self, step: int, steps: int) -> Array:
@@ -60,7 +76,8 @@ class PairWatch:
         if not self.tape.size:
             return self.tape[0]
         if self.used + steps > self.steps:
-            self._search()
+            self._find()
+            self.used = 0
         self.first = step if not self.used else self.first
         self.used += steps
         return self.tape[self.used - steps]
@@ -71,10 +88,14 @@ class PairWatch:
 
     def terms(self) -> dict[str, Array]:
         """Return the terms `closest` and `met` of the sums."""
+        self._find()
+        return {"closest": self.closest.copy(), "met": self.met.copy()}
+
+    def _find(self) -> None:
         if self.least.size:
             self._compare()
-        self._search()
-        return {"closest": self.closest.copy(), "met": self.met.copy()}
+        if len(self.pairs[0]):
+            self._search()
 
     def _compare(self) -> None:
         """Find the closest pairs of those that the kernel kept."""

@@ -34,6 +34,7 @@ from echelon.simulation.step.drive import Chunk, Stepper
 from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.meter import ALWAYS, Sums
 from echelon.simulation.step.records import ComponentMemory, LawMemories, LoopState
+from echelon.simulation.step.roster import ActiveAgents
 from echelon.simulation.step.sequence import begin, said_by
 
 _AGENT_STEPS, _FEWEST = 2_000_000, 4
@@ -101,6 +102,8 @@ class NativeStepper(Stepper):
         # The moment in the blocks: a chunk that continues from it need not be written there.
         self._moment: LoopState | None = None
         self._fallback_step = -1
+        # Which edges have an end that is absent.
+        self._unmeasured: Array = np.array(False)
         axes, count = len(self.loop.meter.paired), len(loops)
         rows = self.plan.rows
         self._pairs = PairWatch(self.places, axes, count, self.dtype, _STEPS, rows)
@@ -173,6 +176,7 @@ class NativeStepper(Stepper):
             self.mail.clear()
             packets = np.zeros((len(states), len(self.rows.packet)))
             memory = memory._replace(network=self.mail.memory(0, packets))
+        memory = memory._replace(roster=self.loop.roster.begin(states))
         cut = np.zeros((len(states), len(self.rows.input)), np.int8)
         return self._moment_of(0, states, memory, cut)
 
@@ -262,13 +266,14 @@ class NativeStepper(Stepper):
         start, sizes = np.asarray(now.states), [len(self.rows.state), len(self.rows.input)]
         x, u = (self.buffers.empty((len(counts), agents, size), float) for size in sizes)
         # Neither is written to, and a copy for many agents takes as long as a step.
-        same = len(counts) == 1 and start.dtype == x.dtype
+        same = len(counts) == 1 and start.dtype == x.dtype and self._new(step) is None
         x = start[None] if same else x
         for k, count in enumerate(counts.tolist()):
             if step > first:
                 self._read(self.rows.state, x[k])
             elif not same:
                 x[k] = start
+            self._renew(step, x[k])
             if count:
                 self._run(step, count, first, table)
                 self._read(self.rows.input, u[k])
@@ -283,6 +288,7 @@ class NativeStepper(Stepper):
 
     def _read_next_inputs(self, step: int, first: int, table: Array | None, out: Array) -> None:
         """Read the inputs of a step that is not taken."""
+        self._enter(step)
         letters = (self.mail.ring, self.mail.mail) if self.mail is not None else ()
         arrays = (self.blocks, self.edges, *self.mirrors, *letters, self._pairs.least)
         copies = [array.copy() for array in arrays]
@@ -302,16 +308,53 @@ class NativeStepper(Stepper):
             size = self.plan.mirror + self.plan.message_size * self.plan.lanes
             most = min(most, _LEADER_NUMBERS // (self.leader_blocks * size))
         while steps:
-            row, constant = self.loop.graph.stretch(step)
             self._begin_span(step)
-            self.neighbourhood = self.neighbourhood._replace(weights=self.edge_weights[row])
+            constant = self._enter(step)
+            self._restart(step)
             count = min(steps, self._pairs.steps, max(1, most), constant)
             later = self._events[self._events > step]
             count = min(count, int(later[0]) - step) if len(later) else count
             count = min(count, self.given.left(step))
-            count = count if self.mail is None else min(count, self.mail.left(step))
+            if self.mail is not None:
+                count = min(count, self.mail.left(step))
+                self._write(self.rows.lead, self.mail.leading(step))
             self._call(step, count, input_step, None if table is None else table[step - first :])
             step, steps = step + count, steps - count
+
+    def _enter(self, step: int) -> int:
+        """Take the links of a step, and who is there; return for how many steps they stay."""
+        row, constant = self.loop.graph.stretch(step)
+        self.neighbourhood = self.neighbourhood._replace(weights=self.edge_weights[row])
+        roster = self.loop.roster
+        if isinstance(roster, ActiveAgents):
+            here = np.asarray(roster.rows[row])
+            self._write(self.rows.here, np.tile(here, len(self.loops))[:, None])
+            leaders = self.places.leaders_of(roster.nearest[row], self.plan.width)
+            self.neighbourhood = self.neighbourhood._replace(leaders=leaders)
+            self._pairs.among(here)
+            ends = here[np.asarray(self.loop.meter.edges)]
+            self._unmeasured = self.places.of_edges(np.asarray(~ends.all(axis=1)))
+        return constant
+
+    def _new(self, step: int) -> Array | None:
+        """Return which agents of all formations begin anew at a step; None for none."""
+        new = self.loop.roster.restarting(step)
+        return None if new is None or not new.any() else np.tile(new, len(self.loops))
+
+    def _renew(self, step: int, states: Array) -> None:
+        """Make states those of the start, of the agents that begin anew at a step."""
+        new = self._new(step)
+        if new is not None:
+            states[new] = np.asarray(self.states, self.dtype)[new]
+
+    def _restart(self, step: int) -> None:
+        """Let the agents begin anew that do at a step."""
+        new = self._new(step)
+        if new is not None:
+            x, memory, cut = self._read_moment()
+            self._renew(step, x)
+            memory[new], cut[new] = self._begun()[new], 0.0
+            self._load(self._whole(step, x, memory, cut))
 
     def _call(self, step: int, steps: int, input_step: int, table: Array | None) -> None:
         """Run the kernel; each step exchanges the two mirrors."""
@@ -342,7 +385,11 @@ class NativeStepper(Stepper):
         if tape.size:
             values["tape_step"], firsts["tape"] = tape.size, tape
         uniform_values = np.empty(steps * self.uniform_count, self.dtype)
+        totals = self.edges[..., -1, :]
+        before = totals.copy() if self._unmeasured.any() else totals
         self.threads.run(self.code, values, firsts, uniform_values)
+        if before is not totals:
+            np.copyto(totals, before, where=self._unmeasured)
         if steps % 2 and not plan.listens_first:
             self.mirrors.reverse()
         if plan.leaders_ahead:
@@ -416,19 +463,29 @@ class NativeStepper(Stepper):
         wide[:, :, : values.shape[1]] = lanes
 
     def _moment_and_sums(self, first: int, step: int) -> tuple[LoopState, Sums]:
-        rows = self.rows
+        rows, kind = self.rows, np.float64
         sums = range(rows.errors.start, rows.tracking.start)
-        parts = ((part, self.dtype) for part in (rows.state, rows.memory, rows.cut))
-        x, memory, cut, agent_sums = (
-            self._read(part, self.buffers.empty((len(self.places.position), len(part)), kind))
-            for part, kind in (*parts, (sums, np.float64))
+        now = self._whole(step, *self._read_moment())
+        agents = len(self.places.position)
+        return now, self._sums(
+            first, step, self._read(sums, self.buffers.empty((agents, len(sums)), kind))
         )
-        whole = self._memory(memory)
+
+    def _read_moment(self) -> list[Array]:
+        """Return states, memories and cuts of all agents."""
+        parts, agents = (self.rows.state, self.rows.memory, self.rows.cut), len(self.states)
+        return [
+            self._read(part, self.buffers.empty((agents, len(part)), self.dtype)) for part in parts
+        ]
+
+    def _whole(self, step: int, x: Array, memory: Array, cut: Array) -> LoopState:
+        """Return the moment at a step of these, and of what else is in the blocks."""
+        whole, packet = self._memory(memory), self.rows.packet
         if self.mail is not None:
-            packets = self._read(rows.packet, np.empty((len(x), len(rows.packet)), self.dtype))
+            packets = self._read(packet, np.empty((len(x), len(packet)), self.dtype))
             whole = whole._replace(network=self.mail.memory(step, packets))
-        now = self._moment_of(step, x, whole, cut.astype(np.int8))
-        return now, self._sums(first, step, agent_sums)
+        starts = self.loop.roster.begin(np.asarray(self.states, self.dtype))
+        return self._moment_of(step, x, whole._replace(roster=starts), cut.astype(np.int8))
 
     def _find_inexact(self) -> None:
         """Note the formations whose numbers are not what JAX computes."""
@@ -448,7 +505,10 @@ class NativeStepper(Stepper):
         self._unsettled = np.full((size[0], 1), -1.0)
 
     def _sums(self, first: int, end: int, agent_sums: Array) -> Sums:
-        rows, leaders, meter = self.rows, self.leaders, self.loop.meter
+        rows, meter = self.rows, self.loop.meter
+        first_agents = len(self.loop.places.offsets) * np.arange(len(self.loops))[:, None]
+        # Backup leaders are not measured as such.
+        leaders = first_agents + np.asarray(meter.leaders)
         steady = max(0, end - max(first, int(meter.first_steady)))
         begin = rows.errors.start
 
@@ -456,7 +516,7 @@ class NativeStepper(Stepper):
             return agent_sums[:, places.start - begin : places.stop - begin]
 
         def of_leaders(places: range) -> Array:
-            block, lane = np.divmod(self.places.position[leaders], self.plan.lanes)
+            block, lane = np.divmod(self.places.position[leaders.reshape(-1)], self.plan.lanes)
             return self.blocks[block, places.start : places.stop, lane].astype(np.float64)
 
         peak = of(rows.peak) if len(self._events) else np.zeros((len(agent_sums), 1))

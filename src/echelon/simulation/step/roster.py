@@ -96,7 +96,7 @@ class Everybody(eqx.Module):
     # Whether agents come or go.
     changes = False
 
-    def begin(self, states: States) -> PyTree:
+    def begin(self, states: States | Array) -> PyTree:
         """Return what is remembered of the start (N, n)."""
         return ()
 
@@ -111,6 +111,10 @@ class Everybody(eqx.Module):
     def arrived(self, now: LoopState, anew: Anew, beside: Beside) -> LoopState:
         """Return the moment with those who join in this step."""
         return now
+
+    def restarting(self, step: int) -> Array | None:
+        """Return which agents (N,) begin anew at a step, for the host; None where none ever do."""
+        return None
 
     def measured(self, meter: RunStatistics, step: jax.Array) -> RunStatistics:
         """Return the meter of errors relative to those whom agents follow at a step."""
@@ -176,9 +180,14 @@ class JoiningAgents(ActiveAgents):
 class ReturningAgents(JoiningAgents):
     """The same, some of which are lost and return where they began."""
 
-    def begin(self, states: States) -> PyTree:
+    def begin(self, states: States | Array) -> PyTree:
         """Return the start."""
         return states
+
+    def restarting(self, step: int) -> Array | None:
+        """Return which agents (N,) begin anew at a step, for the host."""
+        now, before = (self.rows[self.switches.stretch(k)[0]] for k in (step, max(step - 1, 0)))
+        return now & ~before
 
     def _begun(self, new: jax.Array, now: LoopState, anew: Anew) -> LoopState:
         return anew(new, now.memory.roster)
@@ -194,7 +203,7 @@ def roster_of(graph: Graph, settings: Settings, angles: bool) -> Everybody:
         stays = schedule.present[k - 1]
         since[k] = np.where(stays, since[k - 1], schedule.starts[k])
     joins = (np.diff(schedule.present.astype(int), axis=0) > 0).any(axis=0)
-    kind = JoiningAgents if angles else ActiveAgents
+    kind = JoiningAgents if angles and joins.any() else ActiveAgents
     kind = ReturningAgents if (schedule.present[0] & joins).any() else kind
     switches = Switches(*schedule.switches(settings.dt, settings.horizon))
     return kind(switches, schedule.present, schedule.nearest, since)

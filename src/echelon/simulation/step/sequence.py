@@ -117,7 +117,7 @@ def act(loop: Loop, now: LoopState, known: Known, sensing: PyTree, network: PyTr
     return Control(u, limited.any(axis=1), cut, memory, known.said, message)
 
 
-def _held(loop: Loop, mask: Mask, one: LoopState, other: LoopState) -> LoopState:
+def held(loop: Loop, mask: Mask, one: LoopState, other: LoopState) -> LoopState:
     """Return the moment in which some agents' bodies are as in `one`, and others' as in `other`."""
     a, b = one.memory, other.memory
     memory = b._replace(
@@ -139,7 +139,7 @@ def _arrived(loop: Loop, now: LoopState) -> LoopState:
         return moment._replace(memory=moment.memory._replace(laws=laws))
 
     def anew(new: jax.Array, states: States) -> LoopState:
-        return _held(loop, new, begin(loop, states), now)
+        return held(loop, new, begin(loop, states), now)
 
     return loop.roster.arrived(now, anew, beside)
 
@@ -153,7 +153,7 @@ def _moved(loop: Loop, now: LoopState, acted: Control) -> LoopState:
     before = now.memory
     memory = after.memory._replace(laws=before.laws, sensing=before.sensing, plant=before.plant)
     absent = now._replace(step=after.step, memory=memory)
-    return _held(loop, loop.roster.here(now.step), after, absent)
+    return held(loop, loop.roster.here(now.step), after, absent)
 
 
 # ---- steps ---------------------------------------------------------------------------------------
