@@ -4,6 +4,7 @@ Run it with `python docs/scenario_keys.py`.
 """
 
 import inspect
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -15,44 +16,76 @@ from echelon.experiments.scenario.scenario import json_schema
 _HEAD = """# Scenario keys
 
 All keys of a scenario file ([a first one](start.md)). A *section* is a mapping with the keys of its
-table below; a key without a default may be left out. *By state or group* means a mapping from names
+list below; a key without a default may be left out. *By state or group* means a mapping from names
 of the model, such as `{x: 1.0}` or `{position: 1.0}` for all its coordinates. Numbers are in SI
 units and angles in rad; *1* marks a number without a unit. `python: file.py:Class` names a class of
 [yours](extending.md). `docs/scenario_keys.py` writes the page.
 """
 Schema: TypeAlias = Mapping[str, Any]
 """A part of a JSON schema."""
-_COLUMNS = ("key", "what", "unit", "default", "meaning")
+_NAMES = {"ModelSpec": "Models", "ReferenceSpec": "References"}
+"""Sections whose names have a list of their own."""
 
 
 def keys_page() -> str:
     """Return the page in Markdown."""
     schema = json_schema()
-    parts = [_HEAD, *_section("the file", schema, schema["$defs"])]
-    for name, what in schema["properties"].items():
-        inner = _referred(what, schema["$defs"])
-        if inner is not None:
-            parts += _section(f"`{name}`", inner, schema["$defs"])
-    title, defs = "an entry of `motion`, of the formation", schema["$defs"]
-    parts += _section(title, defs["MotionSpec"], defs)
-    parts += _section("`gain`, of leader or follower", schema["$defs"]["GainSpec"], schema["$defs"])
+    defs = schema["$defs"]
+    inner = {name: _referred(what, defs) for name, what in schema["properties"].items()}
+    sections = {"the file": schema} | {f"`{x}`": part for x, part in inner.items() if part}
+    sections["an entry of `motion`, of the formation"] = defs["MotionSpec"]
+    sections["`gain`, of leader or follower"] = defs["GainSpec"]
+    parts, explained = [_HEAD], dict[tuple[str, str], str]()
+    for title, part in sections.items():
+        parts += _section(title, part, defs, explained)
     parts += [*_named("References", registry.REFERENCES), *_named("Models", registry.MODELS)]
     return "\n".join(parts)
 
 
-def _section(title: str, part: Schema, defs: Schema) -> Iterator[str]:
-    """Yield a heading, the section's sentence and the table of its keys."""
+def _section(
+    title: str, part: Schema, defs: Schema, explained: dict[tuple[str, str], str]
+) -> Iterator[str]:
+    """Yield a heading, the section's sentence and the list of its keys."""
     yield f"## {title[0].upper()}{title[1:]}\n"
     yield f"{_line(part['description'])}\n"
-    rows = []
+    family = next((_NAMES[name] for name in _NAMES if defs[name] is part), "")
+    rows, linked = list[str](), list[str]()
     for key, what in part["properties"].items():
         inner = _referred(what, defs)
-        section = inner is not None and inner is not defs["UserClass"]
-        meaning = what.get("description") or (inner or {}).get("description", "")
-        kind = "section" if section else _kind(what, defs)
-        default = _default(key, what, part)
-        rows.append((f"`{key}`", kind, what.get("unit", ""), default, _line(meaning)))
-    yield from _table(_COLUMNS, rows)
+        meaning = _line(what.get("description") or (inner or {}).get("description", ""))
+        if inner is not None and inner is not defs["UserClass"]:
+            kind, meaning = _linked(key, inner, defs, meaning)
+        elif key == "name" and family:
+            kind = f"[name](#{family.lower()})"
+        else:
+            kind = _unit(_kind(what, defs), what.get("unit", ""), meaning)
+        # Keys of several sections are explained where the first one has them.
+        first = explained.setdefault((key, meaning), title)
+        long = len(meaning.split()) > 8 and first != title
+        value = ", ".join(filter(None, (kind, _default(key, what, part))))
+        if meaning:
+            rows.append(f"- `{key}` ({value}): {f'as in {first}.' if long else meaning}")
+        else:
+            linked.append(f"[`{key}`](#{key}){' (required)' * ('required' in value)}")
+    yield from [f"- Sections: {', '.join(linked)}."] * bool(linked)
+    yield from rows
+    yield ""
+
+
+def _linked(key: str, inner: Schema, defs: Schema, meaning: str) -> tuple[str, str]:
+    """Return the link to a section, and its meaning where the section does not state it."""
+    anchors = {"GainSpec": "gain-of-leader-or-follower"}
+    if inner is defs["GainSpec"]:
+        return f"[section](#{anchors['GainSpec']})", meaning
+    if _line(inner.get("description", "")) == meaning and key != "bursts":
+        return f"[section](#{key})", ""
+    return "section", meaning
+
+
+def _unit(kind: str, unit: str, meaning: str) -> str:
+    """Return the type with the unit, unless the meaning states it."""
+    stated = re.search(rf"(, |in (the )?){re.escape(unit)}( units)?\b", meaning) or not unit
+    return kind if stated else f"{kind}; {unit}"
 
 
 def _referred(what: Schema, defs: Schema) -> Schema | None:
@@ -69,7 +102,7 @@ def _default(key: str, what: Schema, part: Schema) -> str:
     value = what.get("default")
     if value in (None, {}):
         return ""
-    return f"`{str(value).lower() if isinstance(value, bool) else value}`"
+    return f"default `{str(value).lower() if isinstance(value, bool) else value}`"
 
 
 def _kind(what: Schema, defs: Schema) -> str:
@@ -92,7 +125,7 @@ def _kind(what: Schema, defs: Schema) -> str:
     return _scalar(what)
 
 
-_SCALARS = {"integer": "whole number", "number": "number", "boolean": "`true` or `false`"}
+_SCALARS = {"integer": "integer", "number": "number", "boolean": "`true`/`false`"}
 
 
 def _scalar(what: Schema) -> str:
@@ -101,19 +134,18 @@ def _scalar(what: Schema) -> str:
         return " or ".join(_kind({"type": each}, {}) for each in kind)
     name = _SCALARS.get(kind, "text" if kind == "string" else "anything")
     if "exclusiveMinimum" in what:
-        return f"{name} above {what['exclusiveMinimum']}"
-    return f"{name} of at least {what['minimum']}" if "minimum" in what else name
+        return f"{name} > {what['exclusiveMinimum']}"
+    return f"{name} >= {what['minimum']}" if "minimum" in what else name
 
 
 def _named(title: str, entries: Mapping[str, registry.Entry]) -> Iterator[str]:
-    """Yield the table of a family's names with the parameters of their classes."""
+    """Yield a family's names with the parameters of their classes."""
     yield f"## {title}\n"
     yield "The names and their keys; units are in the [reference](api.md).\n"
-    rows = []
     for name, entry in entries.items():
-        keys = inspect.signature(resolve(entry)).parameters.values()
-        rows.append((f"`{name}`", entry.summary, ", ".join(map(_key, keys)) or "none"))
-    yield from _table(("name", "what", "keys"), rows)
+        keys = ", ".join(map(_key, inspect.signature(resolve(entry)).parameters.values()))
+        yield f"- `{name}`: {'; '.join(filter(None, (entry.summary, keys)))}"
+    yield ""
 
 
 def _key(key: inspect.Parameter) -> str:
@@ -125,12 +157,6 @@ def _yaml(value: object) -> str:
     if isinstance(value, tuple):
         return f"[{', '.join(map(_yaml, value))}]"
     return str(value).lower() if isinstance(value, bool) or value is None else f"{value}"
-
-
-def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> Iterator[str]:
-    for row in (head, ("---",) * len(head), *rows):
-        yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |"
-    yield ""
 
 
 def _line(text: str) -> str:
