@@ -176,7 +176,7 @@ def longest_step(
     return longest_decay(decays, np.linalg.eigvals(A - B @ gains))
 
 
-def longest_decay(decays: Callable[[float], bool], poles: np.ndarray) -> float:
+def longest_decay(decays: Callable[[float], bool], poles: Array) -> float:
     """Return the longest step (s) with which loops decay, searched as `longest_step` does."""
     # A mode on the imaginary axis has no slowest time; 1e-9 1/s keeps the search finite.
     dt, end = 1e-3 / np.abs(poles).max(), 1e3 / max(1e-9, float(np.abs(np.real(poles)).min()))

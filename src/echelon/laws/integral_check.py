@@ -7,7 +7,7 @@ from echelon.laws.law import Law, Proves
 from echelon.synthesis.gains.integral import Integral
 
 
-def sums_of(law: Law) -> Integral | None:
+def sums_of(law: Law | None) -> Integral | None:
     """Return the integral action of a law; None without any."""
     sums = getattr(law, "integral", None)
     return sums if isinstance(sums, Integral) else None

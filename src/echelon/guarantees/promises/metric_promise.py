@@ -38,6 +38,7 @@ from echelon.guarantees.promises.region import (
     weaken,
     within,
 )
+from echelon.laws.integral_check import sums_of
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts, Starts
 from echelon.simulation.engine.prepare import Prepared
@@ -59,7 +60,9 @@ def claims_line(parts: Parts, loop: LinearLoop, region: RegionCertificate | None
     """
     gain, name, kind = parts.drive.gain, Hypothesis.CLAIMS, Kind.LINEARIZATION
     if gain is None:
-        return unneeded(name, kind, "there is no gain")
+        law = getattr(parts.drive, "follower", None)
+        text = "it is about the law without sums of errors" if sums_of(law) else "there is no gain"
+        return unneeded(name, kind, text)
     text = _difference(parts, gain, loop, region)
     if text:
         return fails(name, kind, text, remedy="the guarantee here is computed from what runs")
