@@ -14,7 +14,7 @@ import echelon as ech
 from echelon.agents.models.linearization import linearize
 from echelon.agents.models.model import Limits
 from echelon.core.errors import EchelonError
-from echelon.core.statement import Topic
+from echelon.core.statement import Hypothesis, Topic, Verdict
 from echelon.experiments.studies.check import check
 from echelon.experiments.studies.design import design
 from echelon.guarantees.promises.promise import guarantee
@@ -335,3 +335,10 @@ def test_outputs_that_inputs_cannot_hold_are_refused(model, gain, weights, messa
     law = ech.laws.Consensus(ech.synthesize(model, SQUARE, method), integral=weights)
     with pytest.raises(EchelonError, match=message):
         law.prepared(model, SQUARE)
+
+
+def test_speeds_of_a_trim_that_moves_are_stated_with_sums_too():
+    parts, settings = ech.build(ech.load_scenario("boats", ["follower.integral=true"]))
+    line = guarantee(parts, settings).hypotheses[Hypothesis.SPEEDS]
+    # A thruster at its limit ends the range, with sums and without.
+    assert line.verdict is Verdict.HOLDS and line.number_text == "0 to 3.08 m/s"

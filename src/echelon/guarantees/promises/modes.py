@@ -14,6 +14,7 @@ from echelon.agents.models.heading_symmetry import (
 )
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.relative_equilibrium import moves, path_states
+from echelon.agents.models.straight_range import is_straight
 from echelon.core.compiled import cached_jit
 from echelon.core.digits import about, at_least, at_most
 from echelon.core.linear import newton_least, sampled_radius
@@ -172,7 +173,7 @@ def _linear(case: GuaranteeInputs, local: LocalCertificate) -> Iterator[Statemen
     yield from local_lines(case.parts, case.settings, local, shorter)
     yield _along(case)
     yield from turning(case)
-    yield from speed_lines(case) if case.governed else ()
+    yield from speed_lines(case) if case.known and is_straight(case.parts.model) else ()
 
 
 # ---- where the model bends ----------------------------------------------------------------------

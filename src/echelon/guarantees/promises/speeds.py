@@ -30,7 +30,7 @@ from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array
 from echelon.core.words import Kind
 from echelon.guarantees.promises.case import GuaranteeInputs
-from echelon.guarantees.promises.integral_modes import slowest_in_axes
+from echelon.guarantees.promises.integral_modes import gain_in_use, slowest_in_axes
 from echelon.simulation.engine.law_drive import Laws
 from echelon.synthesis.gains.gain import Gain
 
@@ -180,7 +180,8 @@ def _speeds(case: GuaranteeInputs, begin: float, end: float) -> PathSpeeds | Non
 def speed_lines(case: GuaranteeInputs) -> Iterator[Statement]:
     """Yield at which speeds the law holds, and whether the path keeps to them; none of rest."""
     model, drive = case.parts.model, case.parts.drive
-    if not (moves(model) and isinstance(drive, Laws) and isinstance(drive.gain, Gain)):
+    made = gain_in_use(drive.follower) if isinstance(drive, Laws) else None
+    if not (moves(model) and isinstance(made, Gain)):
         return
     found, path = speed_range(case), path_speeds(case)
     if found is None:
