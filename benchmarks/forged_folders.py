@@ -1,8 +1,8 @@
 """Forge folders of runs at random places, and count those that `verify` calls verified.
 
-Run `python benchmarks/forged_folders.py [--forged 60] [--honest 60] [--seed 0]`. Runs of a few kinds
-are written: with and without a guarantee, over a radio, with an event. A forgery changes one number or
-text of `summary.json`, numbers of an array of `run.nc`, an attribute of a variable or of the file,
+Run `python benchmarks/forged_folders.py [--forged 60] [--honest 60] [--seed 0]`. Runs of a few
+kinds are written: with and without a guarantee, over a radio, with an event. A forgery changes one
+number or text of `summary.json`, numbers of an array of `run.nc`, an attribute of a variable or of the file,
 a group or variable that echelon does not write, or one number of `report.txt`. What `verify` leaves
 open of an honest run, such as the computing time, is not forged. Honest runs have other seeds.
 """
