@@ -2,9 +2,10 @@
 
 Run `python benchmarks/forged_folders.py [--forged 60] [--honest 60] [--seed 0]`. Runs of a few
 kinds are written: with and without a guarantee, over a radio, with an event. A forgery changes one
-number or text of `summary.json`, numbers of an array of `run.nc`, an attribute of a variable or of the file,
-a group or variable that echelon does not write, or one number of `report.txt`. What `verify` leaves
-open of an honest run, such as the computing time, is not forged. Honest runs have other seeds.
+number or text of `summary.json`, numbers of an array of `run.nc`, an attribute of a variable or of
+the file, a group or variable that echelon does not write, or one number of `report.txt`. What
+`verify` leaves open of an honest run, such as the computing time, is not forged. Honest runs have
+other seeds.
 """
 
 import argparse
