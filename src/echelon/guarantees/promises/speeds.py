@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool
 
+from echelon.agents.models.heading_symmetry import state_turn
 from echelon.agents.models.linearization import Linearization
 from echelon.agents.models.model import ControlAffine, position_unit
 from echelon.agents.models.model_check import limited
@@ -75,8 +76,10 @@ class SteadyModes(NamedTuple):
 
 def slowest_about(case: GuaranteeInputs, x: Array, v: Array, rate: float = 0.0) -> float:
     """Return the slowest mode (1/s) about a state and a normalized input, in axes that turn."""
-    slopes = _slopes(case.parts.model, jnp.asarray(x), jnp.asarray(v))
-    return slowest_in_axes(case.parts, case.loop, Linearization(*map(np.asarray, slopes)), rate)
+    model = case.parts.model
+    A, B = (np.asarray(part) for part in _slopes(model, jnp.asarray(x), jnp.asarray(v)))
+    turning = Linearization(A - rate * state_turn(model).slope, B)
+    return slowest_in_axes(case.parts, case.loop, turning, rate)
 
 
 @cached_jit
