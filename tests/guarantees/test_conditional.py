@@ -104,6 +104,21 @@ def test_the_badge_says_what_is_conditional_and_what_is_none():
     assert guarantee_badge(found.as_mapping())["short"] == "no guarantee"
 
 
+@pytest.mark.parametrize("network", [None, "network={rate: 50, delay: 0.02}"])
+def test_of_a_leader_that_is_lost_no_loop_without_it_is_judged(network):
+    settings = [
+        "leadership={backups: [1]}",
+        "events=[{at: 12, lose: 0}]",
+        *[network] * bool(network),
+    ]
+    if network:
+        settings[0] = "leadership={backups: [1], timeout: 0.3}"
+    found = ech.guarantee(*ech.build(ech.load_scenario("planar-quadrotor", settings)))
+    [reason] = found.reasons
+    # The loop of followers without anybody to follow is not what runs: the backup leads.
+    assert not found.promised and "backup" in reason
+
+
 WEAK = "plant={agents: {2: {parameters: {motor_thrust: 0.06}}}}"
 
 

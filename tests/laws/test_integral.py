@@ -285,6 +285,26 @@ def test_check_and_design_state_what_sums_cost():
     assert 0.005 < best.step < 0.1 and best.delay > 0.0
 
 
+class Deaf(ech.laws.Consensus):
+    """A law of a user's own that is given sums, and does not use them."""
+
+    def update(self, model, view, memory):
+        v = self.gain.feedback(model, view.x, view.disagreement, self.angle)
+        return model.physical(-v, trim=True), memory
+
+
+def test_nothing_is_claimed_of_sums_that_do_not_act_or_of_loops_that_grow():
+    leader, tree = ech.laws.Tracking(LINE), ech.Graph.path(4)
+    own = Deaf(gain_for(PLANAR, tree), integral=True)
+    # A fifth of the least coupling, 1/(2 lambda_min).
+    weak = follower(PLANAR, True, tree, 0.1 / tree.spectrum().low)
+    for follows, said in ((own, []), (weak, ["not needed"])):
+        parts = parts_of(PLANAR, leader, follows, tree)
+        lines = [x for x in check(parts, STEPS).lines if x.statement is Topic.INTEGRAL]
+        assert [str(x.verdict) for x in lines] == said
+        assert not any("constant pushes" in x.text for x in lines)
+
+
 class Stubborn(ech.models.DoubleIntegrator):
     """A point of which the force moves both coordinates alike, but the second twice as much."""
 

@@ -38,7 +38,7 @@ _STIFF = 1e10
 def margin_lines(parts: Parts, settings: Settings, promise: Guarantee) -> Iterator[Statement]:
     """Yield the margins of a stable loop."""
     loop = promise.loop
-    yield from sum_lines(parts, loop)
+    yield from sum_lines(parts, loop, promise.decays)
     if parts.graph.schedule is not None:
         yield from _switching_lines(promise)
         return

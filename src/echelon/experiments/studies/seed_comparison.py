@@ -128,8 +128,9 @@ class SeedComparison(NamedTuple):
 
     @property
     def equal(self) -> bool:
-        """Whether all seeds give the same runs, as where nothing is random."""
-        return all(len({*row.ranked(x)}) < 2 for x in self.names for row in self.compared)
+        """Whether all seeds give the same numbers, as where nothing is random."""
+        rows = [(row, x) for x in self.names for row in self.compared]
+        return bool(rows) and all(len({*row.ranked(x)}) < 2 for row, x in rows)
 
     def unit(self, name: str) -> str:
         """Return the unit of a number."""

@@ -79,6 +79,7 @@ class Fault(enum.StrEnum):
     LASTING = "the law reads a memory that nothing changes"
     ADRIFT = "nothing drives a state to its goal"
     SWITCHES = "the graph has no period of whole steps"
+    LEADERLESS = "the leader is lost, and a backup leader leads"
     LARGE = "the formation is too large, and its agents are not alike"
     UNDECIDED = "rounding hides whether the slowest mode decays"
     GROWS = "errors grow in the steps that run"
@@ -136,6 +137,8 @@ def local_certificate(prepared: Prepared) -> LocalCertificate:
     row, repeats = _graph_of(prepared)
     if not repeats:
         return LocalCertificate((Fault.SWITCHES,))
+    if not _led(parts.graph, row):
+        return LocalCertificate((Fault.LEADERLESS,))
     period = period_of(problem, repeats)
     settled = _settled_after(prepared, period)
     loop = resting_loop(prepared, row, settled + 3 * period)
@@ -214,6 +217,12 @@ def _graph_of(prepared: Prepared) -> tuple[int | None, int]:
     if stepped is None or stepped.period is None:
         return None, 0
     return None, round(stepped.period / dt)
+
+
+def _led(graph: Graph, row: int | None) -> bool:
+    """Tell whether a leader of the graph, and no backup leader, leads in a row of its schedule."""
+    present = None if graph.schedule is None or row is None else graph.schedule.present
+    return present is None or bool(present[row, list(graph.leaders)].any())
 
 
 def _settled_after(prepared: Prepared, period: int) -> int:

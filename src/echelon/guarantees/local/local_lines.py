@@ -132,7 +132,7 @@ def _decays(parts: Parts, settings: Settings, local: LocalCertificate, shorter: 
 
 
 _TOLD = {Fault.TIME, Fault.WHOLE, Fault.SWITCHES, Fault.PLACES}
-_TOLD |= {Fault.NO_REST, Fault.OFF_GOALS, Fault.KINK}
+_TOLD |= {Fault.NO_REST, Fault.OFF_GOALS, Fault.KINK, Fault.LEADERLESS}
 """What other lines tell."""
 
 

@@ -15,7 +15,7 @@ from echelon.agents.models.model import ControlAffine
 from echelon.core.digits import about, at_least, at_most
 from echelon.core.errors import listing
 from echelon.core.linear import discretize, longest_decay, spectral_radii
-from echelon.core.statement import Statement, Topic, holds
+from echelon.core.statement import Statement, Topic, holds, unneeded
 from echelon.core.types import Array
 from echelon.core.words import Kind
 from echelon.guarantees.promises.closed_loop import LinearLoop, telling
@@ -113,9 +113,9 @@ class SumCost(NamedTuple):
 
 
 def sum_costs(parts: Parts, loop: LinearLoop) -> Iterator[SumCost]:
-    """Yield what sums cost the followers and the leader; nothing of those without any."""
+    """Yield what sums cost the followers and the leader; nothing of laws of a user's own."""
     laws = parts.drive
-    if not isinstance(laws, Laws):
+    if not isinstance(laws, Laws) or laws.unknown:
         return
     own = getattr(laws.leader, "regulator", None), _OWN
     each = {"followers": (getattr(laws.follower, "gain", None), loop.eigenvalues), "leader": own}
@@ -131,18 +131,22 @@ def sum_costs(parts: Parts, loop: LinearLoop) -> Iterator[SumCost]:
         yield SumCost(whose, sums, float(plain), float(modes.real.max()), float(abs(modes).max()))
 
 
-def sum_lines(parts: Parts, loop: LinearLoop) -> Iterator[Statement]:
-    """Yield what sums do and cost, as lines of a check."""
+def sum_lines(parts: Parts, loop: LinearLoop, decays: bool) -> Iterator[Statement]:
+    """Yield what sums do and cost, as lines of a check; what they do where the loop decays."""
     names = parts.model.state_names
     for cost in sum_costs(parts, loop):
         listed = listing(names[k] for k in cost.sums.outputs)
         weights = ", ".join(about(weight) for weight in cost.sums.used)
-        rates = at_least(cost.slowest), at_least(cost.plain)
         who = "the leader sums" if cost.whose == "leader" else "the followers sum"
-        text = (
-            f"{who} errors of {listed}, weights {weights}: slowest mode {rates[0]} "
-            f"1/s, {rates[1]} 1/s without; constant pushes leave no error behind a leader at "
-            "constant velocity, and a lag on curves"
+        text = f"{who} errors of {listed}, weights {weights}"
+        if not decays:
+            yield unneeded(Topic.INTEGRAL, Kind.LINEARIZATION, f"{text}; errors do not decay")
+            continue
+        rates = at_least(cost.slowest), at_least(cost.plain)
+        text += (
+            f": slowest mode {rates[0]} 1/s, {rates[1]} 1/s without; constant pushes that the "
+            "inputs can hold leave no error behind a leader at constant velocity, and a lag on "
+            "curves"
         )
         change = f"{about(100.0 * abs(cost.lost))} % {'slower' if cost.lost > 0.0 else 'faster'}"
         yield holds(Topic.INTEGRAL, Kind.LINEARIZATION, text, cost.lost, change)

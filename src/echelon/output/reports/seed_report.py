@@ -79,7 +79,7 @@ def _notes(comparison: SeedComparison) -> Iterator[str]:
     if any(set(row.ended) - {"completed"} for row in methods):
         yield "A run without a number, as one that diverged, counts as worse than all others."
     if len(comparison.seeds) > 1 and methods and comparison.equal:
-        yield "All seeds give the same run: nothing in this scenario is random."
+        yield "All seeds give the same numbers: here a seed changes nothing."
     for row in comparison.rows:
         if row.outcomes and row not in methods:
             done = f"{len(row.outcomes)} of {amount(len(comparison.seeds), 'run')}"

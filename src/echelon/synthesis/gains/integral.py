@@ -116,7 +116,7 @@ class Integral(eqx.Module):
     ) -> Sum:
         """Return the sums (q,) after a step.
 
-        Where an actuator cannot deliver what is desired, sums that would ask for more stop.
+        Where an actuator cannot deliver what is desired, sums that would ask for more slow down.
 
         Args:
             model: the agent.
