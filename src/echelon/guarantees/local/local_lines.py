@@ -96,7 +96,7 @@ def _smooth(parts: Parts, local: LocalCertificate) -> Statement:
 
 def _decays(parts: Parts, settings: Settings, local: LocalCertificate, shorter: float) -> Statement:
     name, radius = Hypothesis.DISAGREEMENT_DECAY, local.radius
-    if radius is None or Fault.LARGE in local.faults:
+    if radius is None or {Fault.LARGE, Fault.LEADERLESS} & {*local.faults}:
         return _undecided(local)
     rate, dt = local.rate(settings.dt), settings.dt
     shown = "" if rate is None else f"{at_least(-rate)} 1/s"
@@ -132,7 +132,7 @@ def _decays(parts: Parts, settings: Settings, local: LocalCertificate, shorter: 
 
 
 _TOLD = {Fault.TIME, Fault.WHOLE, Fault.SWITCHES, Fault.PLACES}
-_TOLD |= {Fault.NO_REST, Fault.OFF_GOALS, Fault.KINK, Fault.LEADERLESS}
+_TOLD |= {Fault.NO_REST, Fault.OFF_GOALS, Fault.KINK}
 """What other lines tell."""
 
 
@@ -146,6 +146,8 @@ def _undecided(local: LocalCertificate) -> Statement:
         return fails(name, _LINEAR, text, remedy="take fewer agents", reason=text)
     text = str(next(iter(local.faults), _UNKNOWN))
     remedy = "bring the units nearer to each other, or let the slowest mode decay faster"
+    if Fault.LEADERLESS in faults:
+        remedy = "keep the leader to see what is guaranteed with it"
     return fails(name, _LINEAR, text, remedy=remedy, reason=text)
 
 
