@@ -66,7 +66,11 @@ def leader_gain_of(drive: Controller) -> Gain | None:
     return gain_of(drive.leader) if isinstance(drive, Laws) else None
 
 
-_NUMBERS = tuple(x.key or name for name, x in shown_in(RUN_NUMBERS, Appearance.SUMMARY).items())
+COVERED = "covered"
+"""Of a guarantee, what only the run itself gives."""
+
+_SHOWN = (x.key or name for name, x in shown_in(RUN_NUMBERS, Appearance.SUMMARY).items())
+_NUMBERS = tuple(name for name in _SHOWN if name != COVERED)
 OBSERVED = ("outcome", "leader", "leaders", "followers", "edges", *_NUMBERS)
 OBSERVED += ("event_outcomes", "steady_window_s", "warnings", "engine", "wall_time_s", "versions")
 """The other entries of a summary, which only the run itself gives."""
@@ -88,7 +92,7 @@ def summary(result: Result, numbers: Metrics | None = None) -> JsonObject:
     return {
         **follows,
         # What follows from the parts, and whether this run kept to it.
-        "guarantee": {**follows["guarantee"], "covered": observed["covered"]},
+        "guarantee": {**follows["guarantee"], COVERED: observed[COVERED]},
         "outcome": {"name": result.outcome.name.lower(), "message": result.message},
         "leader": numbers.leader._asdict(),
         "leaders": [leader._asdict() for leader in numbers.leaders],
@@ -100,7 +104,7 @@ def summary(result: Result, numbers: Metrics | None = None) -> JsonObject:
             {"edge": list(row.edge), "distance_rmse": row.distance_rmse}
             for row in _listed(numbers.edges, distance_error)
         ],
-        **{k: x for k, x in observed.items() if k != "covered"},
+        **{name: observed[name] for name in _NUMBERS},
         **({"event_outcomes": outcomes} if result.parts.events else {}),
         "steady_window_s": numbers.steady_window,
         "warnings": list(result.warnings),

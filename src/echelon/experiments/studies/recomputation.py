@@ -16,7 +16,7 @@ from echelon.core.words import amount
 from echelon.experiments.results.dataset import labelled_parts
 from echelon.experiments.results.labelled import Labelled, groups_of
 from echelon.experiments.results.recording import Recording, read_recording
-from echelon.experiments.results.summary import OBSERVED, leader_gain_of, statement
+from echelon.experiments.results.summary import COVERED, OBSERVED, leader_gain_of, statement
 from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.experiments.scenario.self_contained import without_folders
@@ -178,10 +178,6 @@ def compare_gain(file: Path, experiment: Experiment) -> Iterator[ClaimCheck]:
     # The name of a class may change with the version, and the verifier has evaluated it.
     stored, value = ({**each["model"], "class": ""} for each in (stored, value))
     yield from compare_values(f"{file.name}: model", stored, value)
-
-
-COVERED = "covered"
-"""Of a guarantee, what only the run itself gives."""
 
 
 def compare_claims(stored: JsonObject, experiment: Experiment, name: str) -> Iterator[ClaimCheck]:

@@ -17,7 +17,7 @@ from echelon.core.types import PathLike
 from echelon.experiments.results.dataset import SUM, labelled_parts, run_file, with_sums
 from echelon.experiments.results.labelled import Labelled
 from echelon.experiments.results.recording import read_recording
-from echelon.experiments.results.summary import OBSERVED, summary
+from echelon.experiments.results.summary import COVERED, OBSERVED, summary
 from echelon.experiments.scenario.build import Experiment, build, origin_of
 from echelon.experiments.scenario.scenario import (
     SCENARIO_FILE,
@@ -28,12 +28,7 @@ from echelon.experiments.scenario.scenario import (
 )
 from echelon.experiments.scenario.self_contained import files_of, names_code, without_folders
 from echelon.experiments.studies.causes import moved_starts
-from echelon.experiments.studies.recomputation import (
-    COVERED,
-    compare_structure,
-    experiment_of,
-    recompute,
-)
+from echelon.experiments.studies.recomputation import compare_structure, experiment_of, recompute
 from echelon.guarantees.promises.promise import guarantee
 from echelon.guarantees.verifier import verify as verifier
 from echelon.guarantees.verifier.findings import ClaimCheck, unchecked
