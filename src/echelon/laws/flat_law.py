@@ -1,8 +1,9 @@
 """The common base of leaders and followers under the law `stopping-point`."""
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import TypeAlias
+from typing import Self, TypeAlias, cast
 
 import equinox as eqx
 import jax
@@ -14,10 +15,10 @@ from echelon.agents.models.chains import (
     Chains,
     chains_of,
     check_bounds,
-    initial_integrators,
     to_flat,
 )
 from echelon.agents.models.model import ControlAffine, FlatBound
+from echelon.agents.models.unlike import UnlikeAgents
 from echelon.agents.network.formation_motion import OwnOffset
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import LawError, ModelError, listing
@@ -26,6 +27,7 @@ from echelon.core.types import Array, Input, Scalar, State
 from echelon.laws.flat_loop import FlatLoop, FlatMemory, Observer
 from echelon.laws.law import Checks, Feeds, KeepsApart, Law, LocalView, Speaks
 from echelon.laws.safety import MOST_POINTS, hull_points
+from echelon.laws.unlike_loop import UnlikeLoop
 
 Speed: TypeAlias = float | tuple[float, ...]
 
@@ -74,7 +76,7 @@ class FlatLaw(Law, Speaks, Feeds, KeepsApart, Checks):
     coupling: float | None = None
     speed: Speed | None = eqx.field(default=None, converter=plain_speeds)
     observer: Observer = eqx.field(default=Observer(), static=True, converter=Observer.of)
-    loop: FlatLoop | None = None
+    loop: FlatLoop | UnlikeLoop | None = None
     speeds: Speed | None = None
 
     def __check_init__(self) -> None:
@@ -119,7 +121,7 @@ class FlatLaw(Law, Speaks, Feeds, KeepsApart, Checks):
 
     @property
     def ready(self) -> FlatLoop:
-        """The loop of a prepared law.
+        """The loop of a prepared law; that of unlike agents has the same methods.
 
         Raises:
             LawError: it is not prepared.
@@ -128,42 +130,50 @@ class FlatLaw(Law, Speaks, Feeds, KeepsApart, Checks):
             raise LawError(
                 f"`{type(self).__name__}` has no loop yet; call `prepared(model, graph)` first."
             )
-        return self.loop
+        return cast(FlatLoop, self.loop)
 
     def speed_of(self, output: int) -> float:
         """Return s of an output."""
         assert self.speeds is not None, "`prepared` finds the speeds"
         return float(self.speeds[output] if isinstance(self.speeds, Sequence) else self.speeds)
 
-    def build_loop(self, model: ControlAffine) -> FlatLoop:
+    def build_loop(self, model: ControlAffine) -> FlatLoop | UnlikeLoop:
         """Return the inner loop for a model.
 
         Raises:
             LawError: the model has no flat coordinates, or bounds of which nothing is proved, or
                 roots or speeds are not as many as it needs.
         """
-        try:
-            chains = chains_of(model)
-            check_bounds(model, chains)
-        except ModelError as error:
-            raise LawError(str(error)) from None
-        needed, m = max(chains.degrees) - 1, len(chains.outputs)
+        kinds = [(part, _checked_chains(part)) for part in groups_of(model)]
+        longest = max(kinds, key=lambda pair: max(pair[1].degrees))
+        needed = max(longest[1].degrees) - 1
         if self.roots is not None and len(self.roots) != needed:
             raise LawError(
-                f"`roots` are {list(self.roots)}, and `{type(model).__name__}` needs {needed}: its "
-                f"longest chain is of {needed + 1} integrators."
+                f"`roots` are {list(self.roots)}, and `{type(longest[0]).__name__}` needs "
+                f"{needed}: its longest chain is of {needed + 1} integrators."
             )
-        if isinstance(self.speed, Sequence) and len(self.speed) != m:
+        roots = self.roots_for(needed)
+        loops = [
+            FlatLoop.of(part, chains, roots[: max(chains.degrees) - 1], self.observer)
+            for part, chains in kinds
+        ]
+        loop = loops[0]
+        if isinstance(model, UnlikeAgents):
+            if self.safety is not None:
+                raise LawError("`safety` is of agents that are alike, and these are not.")
+            loop = UnlikeLoop.of(model, loops, self.observer)
+        outputs = loop.chains.outputs
+        if isinstance(self.speed, Sequence) and len(self.speed) != len(outputs):
             raise LawError(
                 f"`speed` has {len(self.speed)} numbers, and must be one, or one for each of "
-                f"{listing(chains.outputs)}."
+                f"{listing(outputs)}."
             )
-        return FlatLoop.of(model, chains, self.roots_for(needed), self.observer)
+        return loop
 
     def speeds_within(
         self,
         model: ControlAffine,
-        chains: Chains,
+        loop: FlatLoop | UnlikeLoop,
         most: float,
         share: float,
         links: int = 1,
@@ -176,14 +186,19 @@ class FlatLaw(Law, Speaks, Feeds, KeepsApart, Checks):
         if self.speed is not None:
             return self.speed
         link = most if links == 1 else min(most, max(most / links, _CHAINED))
-        speeds = dict.fromkeys(chains.outputs, link)
-        for bound in model.flat_bounds or ():
-            degree = chains.degrees[chains.outputs.index(bound.outputs[0])]
-            left = _left(self.roots_for(degree - 1), bound, slowest(bound))
-            cap = most if links == 1 else math.inf
-            bounded = min(cap, share * left) / links if left > 0.0 else link
-            speeds |= dict.fromkeys(bound.outputs, bounded)
-        return tuple(speeds.values())
+        each = list[dict[str, float]]()
+        for part, own in zip(groups_of(model), loops_of(loop), strict=True):
+            chains, speeds = own.chains, dict.fromkeys(own.chains.outputs, link)
+            for bound in part.flat_bounds or ():
+                degree = chains.degrees[chains.outputs.index(bound.outputs[0])]
+                left = _left(self.roots_for(degree - 1), bound, slowest(bound))
+                cap = most if links == 1 else math.inf
+                bounded = min(cap, share * left) / links if left > 0.0 else link
+                speeds |= dict.fromkeys(bound.outputs, bounded)
+            each.append(speeds)
+        # All groups agree on a place, so that the slowest sets the speed.
+        names = loop.chains.outputs
+        return tuple(min(x[name] for x in each if name in x) for name in names)
 
     def bounded(self, x: jax.Array) -> jax.Array:
         """Return sigma(x) = x / sqrt(1 + (x/s)^2): odd, increasing, of slope 1 at 0, below s."""
@@ -206,10 +221,7 @@ class FlatLaw(Law, Speaks, Feeds, KeepsApart, Checks):
 
     def initial_memory(self, model: ControlAffine, x: State, ahead: jax.Array) -> FlatMemory:
         """Return the memory of an agent that begins at x, with the derivatives of its reference."""
-        loop, e = self.ready, initial_integrators(model, self.ready.chains, x, ahead)
-        # All take the turn that is next to one heading, so that it is a number like any other (T5).
-        memory = loop.beside(loop.initial_memory(model, x, e), loop.stop(ahead))
-        return self._counting(memory)
+        return self._counting(self.ready.begin(model, x, ahead))
 
     def beside(self, memory: FlatMemory, signal: jax.Array) -> FlatMemory:
         """Return the memory of an agent that begins late, its heading next to that of a signal."""
@@ -287,11 +299,25 @@ class FlatLaw(Law, Speaks, Feeds, KeepsApart, Checks):
 
     def refusals(self, model: ControlAffine, states: Array) -> Iterator[tuple[int, str]]:
         """Yield the starts outside of the model's flat coordinates."""
+        if isinstance(model, UnlikeAgents):
+            for k, part in enumerate(model.models):
+                mine = np.flatnonzero(np.asarray(states)[:, -1] == k)
+                own = np.asarray(states)[mine][:, model.states_of(k)]
+                found = self._of_group(k).refusals(part, own) if len(mine) else ()
+                yield from ((int(mine[row]), why) for row, why in found)
         for bound in model.flat_bounds or ():
             if len(bound.outputs) > 1:
                 yield from self._starts_at_rest(model, states, bound)
             else:
                 yield from _outside(self.ready.chains, model, states, bound)
+
+    def _of_group(self, kind: int) -> Self:
+        """Return the law of a group of unlike agents."""
+        loop = self.loop
+        assert isinstance(loop, UnlikeLoop)
+        law = eqx.tree_at(lambda law: law.loop, self, loop.loops[kind])
+        ahead = getattr(law, "ahead", None)
+        return law if ahead is None else dataclasses.replace(law, ahead=loop.ahead_of(kind, ahead))
 
     def _starts_at_rest(
         self, model: ControlAffine, states: Array, bound: FlatBound
@@ -307,6 +333,25 @@ class FlatLaw(Law, Speaks, Feeds, KeepsApart, Checks):
         names = listing(name + "'" * bound.derivative for name in bound.outputs)
         for k in np.flatnonzero(~(np.linalg.norm(values, axis=1) > bound.above + _REST)):
             yield int(k), f"{names} are 0 there, and allowed is {bound.within}"
+
+
+def groups_of(model: ControlAffine) -> tuple[ControlAffine, ...]:
+    """Return the models of all groups of agents: one, unless they are unlike."""
+    return model.models if isinstance(model, UnlikeAgents) else (model,)
+
+
+def loops_of(loop: FlatLoop | UnlikeLoop) -> tuple[FlatLoop, ...]:
+    """Return the loops of all groups."""
+    return loop.loops if isinstance(loop, UnlikeLoop) else (loop,)
+
+
+def _checked_chains(model: ControlAffine) -> Chains:
+    try:
+        chains = chains_of(model)
+        check_bounds(model, chains)
+    except ModelError as error:
+        raise LawError(str(error)) from None
+    return chains
 
 
 def _left(roots: tuple[float, ...], bound: FlatBound, slowest: float) -> float:

@@ -14,7 +14,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.agents.models.chains import Chains, angles_among, flat_output, to_flat
+from echelon.agents.models.chains import (
+    Chains,
+    angles_among,
+    flat_output,
+    initial_integrators,
+    to_flat,
+)
 from echelon.agents.models.model import ControlAffine, wrap_angles
 from echelon.agents.network.formation_motion import OwnOffset
 from echelon.core.errors import LawError, listing
@@ -85,6 +91,7 @@ class FlatMemory(NamedTuple):
         active: how many others changed the rate in the step before; None where none may.
         heading: the angles of zeta less the offset in the step before, rad, next to which the next
             ones are taken; None where no flat output is an angle.
+        carried: zeta (m,) of outputs that the agent does not have; None where agents are alike.
     """
 
     chain: jax.Array
@@ -96,6 +103,7 @@ class FlatMemory(NamedTuple):
     scale: jax.Array | None = None
     active: jax.Array | None = None
     heading: jax.Array | None = None
+    carried: jax.Array | None = None
 
 
 @final
@@ -136,6 +144,12 @@ class FlatLoop(eqx.Module):
 
     # ---- memory ----
 
+    def begin(self, model: ControlAffine, x: State, ahead: jax.Array) -> FlatMemory:
+        """Return the memory of an agent that begins at x, with what is ahead (r, m)."""
+        memory = self.initial_memory(model, x, initial_integrators(model, self.chains, x, ahead))
+        # All take the turn that is next to one heading, so that it is a number like any other (T5).
+        return self.beside(memory, self.stop(ahead))
+
     def zero_memory(self) -> FlatMemory:
         """Return a memory of zeros."""
         zero = jnp.zeros(len(self.stiffness))
@@ -160,13 +174,7 @@ class FlatLoop(eqx.Module):
         self, model: ControlAffine, values: jax.Array, offset: State, memory: FlatMemory
     ) -> jax.Array:
         place = self.stop(values) - self.shift(model, offset)
-        if memory.heading is None:
-            return place
-        # A measured angle may jump by a whole turn, and this one does not. Without a turn to
-        # subtract no bit changes.
-        angles = np.array(self.angles)
-        turns = jnp.round((place[angles] - memory.heading) / (2.0 * jnp.pi))
-        return place.at[angles].add(-2.0 * jnp.pi * turns)
+        return beside_turns(place, memory.heading, self.angles)
 
     def beside(self, memory: FlatMemory, place: jax.Array) -> FlatMemory:
         """Return the memory of an agent that takes its angles next to those of a place (m,)."""
@@ -342,6 +350,17 @@ class FlatLoop(eqx.Module):
         first, second = jax.jvp(speed, (x,), (velocity(x),))
         at_once = np.array(self.chains.degrees) == 1
         return jnp.where(at_once, output(x), first), jnp.where(at_once, first, second)
+
+
+def beside_turns(place: jax.Array, heading: jax.Array | None, angles: tuple[int, ...]) -> jax.Array:
+    """Return a place (m,) with its angles next to those of a step before; None for no angles."""
+    if heading is None:
+        return place
+    # A measured angle may jump by a whole turn, and this one does not. Without a turn to subtract
+    # no bit changes.
+    where = np.array(angles)
+    turns = jnp.round((place[where] - heading) / (2.0 * jnp.pi))
+    return place.at[where].add(-2.0 * jnp.pi * turns)
 
 
 def _moved(tower: Sequence[jax.Array], period: Scalar | float, more: int) -> jax.Array:

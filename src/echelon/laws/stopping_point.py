@@ -24,6 +24,7 @@ from echelon.laws.flat_law import CHAIN_SHARE, LEAD_SHARE, LEAD_SPEED, SHARE, SP
 from echelon.laws.flat_loop import FlatMemory
 from echelon.laws.law import Expected, Law, LocalView, Proves, Travels
 from echelon.laws.safety import Safety
+from echelon.laws.unlike_loop import UnlikeLoop
 
 # ---- the decay of a stopping point whose speed is bounded ----------------------------------------
 
@@ -134,7 +135,6 @@ class StoppingPoint(FlatLaw, Proves):
         ahead: (r, m) the beginning of the leader's path; set by `following`.
     """
 
-    prover = "echelon.guarantees.stopping.stopping_promise:StoppingPromise"
     feedforward: Feedforward = eqx.field(
         default=Feedforward.RELAY, static=True, converter=Feedforward.named
     )
@@ -156,6 +156,13 @@ class StoppingPoint(FlatLaw, Proves):
             check_kind("safety", self.safety, Safety, LawError)
             if self.feedforward is Feedforward.PARENT:
                 raise LawError("`safety` needs `feedforward: relay`, one zeta' for all agents.")
+
+    @property
+    def prover(self) -> str:  # pyright: ignore
+        """The theorem of this law; of unlike agents, what the running step shows."""
+        if isinstance(self.loop, UnlikeLoop):
+            return Law.prover
+        return "echelon.guarantees.stopping.stopping_promise:StoppingPromise"
 
     @property
     def leaderward(self) -> bool:
@@ -180,7 +187,7 @@ class StoppingPoint(FlatLaw, Proves):
             links = int(graph.depths().max())
         loop = self.build_loop(model)
         reach = GraphDemand.of(graph, self.leaderward, links)
-        speeds = self.speeds_within(model, loop.chains, SPEED, _share(links), links)
+        speeds = self.speeds_within(model, loop, SPEED, _share(links), links)
         # All of it anew, since a law may come from a run of another model or graph.
         law = eqx.tree_at(
             lambda law: (law.loop, law.reach, law.ahead, law.speeds),
@@ -211,7 +218,7 @@ class StoppingPoint(FlatLaw, Proves):
         assert self.reach is not None
         links, slowest = self.reach.links, functools.partial(leader.slowest_along, model)
         # A bound of several outputs leaves more speed where the path keeps away from it.
-        speeds = self.speeds_within(model, self.loop.chains, SPEED, _share(links), links, slowest)
+        speeds = self.speeds_within(model, self.loop, SPEED, _share(links), links, slowest)
         return eqx.tree_at(lambda law: (law.ahead, law.speeds), self, (ahead, speeds))
 
     def check_late(self, graph: Graph, period: float) -> None:
@@ -302,7 +309,7 @@ class StoppingLeader(FlatLaw, Travels, Proves):
         law = eqx.tree_at(lambda law: law.loop, self, loop, **none)
         speeds = self.speeds_within(
             model,
-            loop.chains,
+            loop,
             LEAD_SPEED,
             LEAD_SHARE,
             slowest=functools.partial(law.slowest_along, model),

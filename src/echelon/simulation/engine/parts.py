@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.models.unlike import UnlikeAgents
 from echelon.agents.network.events import Event
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
@@ -96,6 +97,11 @@ class Parts:
             )
         self._check_starts()
         object.__setattr__(self, "events", tuple(self.events))
+        if isinstance(self.model, UnlikeAgents):
+            places = self.formation
+            offsets = self.model.with_kinds(places.offsets)
+            unlike = Formation(offsets, places.motion, places.remarks)
+            object.__setattr__(self, "formation", unlike)
         object.__setattr__(self, "graph", self.graph.with_events(self.events, self.backups))
 
     def _check_starts(self) -> None:
@@ -174,6 +180,7 @@ class Starts:
 
     def __init__(self, parts: Parts) -> None:
         model, graph, initial = parts.model, parts.graph, parts.initial
+        self.model = model
         self.graph, self.shape = graph, (graph.agents, len(model.state_names))
         self.error = _per_state(model, parts.start_error, "start error")
         self.states: np.ndarray | None = None
@@ -209,7 +216,7 @@ class Starts:
         states = self.goals + deviations
         _place(states, self.named, self.graph)
         states[:, [agent for agent in leaders if agent in self.named]] += self.error
-        return states
+        return self.model.settled(states) if isinstance(self.model, UnlikeAgents) else states
 
 
 def _place(states: Float[Array, "K N n"], named: Mapping[int, ArrayLike], graph: Graph) -> None:
