@@ -71,6 +71,7 @@ class FlatLaw(Law, Speaks, Feeds, KeepsApart, Checks):
         speeds: s in use; computed by `prepared`.
     """
 
+    unlike = True
     roots: tuple[float, ...] | None = eqx.field(default=None, static=True)
     rate: float | None = eqx.field(default=None, static=True)
     coupling: float | None = None
@@ -161,7 +162,7 @@ class FlatLaw(Law, Speaks, Feeds, KeepsApart, Checks):
         if isinstance(model, UnlikeAgents):
             if self.safety is not None:
                 raise LawError("`safety` is of agents that are alike, and these are not.")
-            loop = UnlikeLoop.of(model, loops, self.observer)
+            loop = UnlikeLoop.of(model, loops, roots)
         outputs = loop.chains.outputs
         if isinstance(self.speed, Sequence) and len(self.speed) != len(outputs):
             raise LawError(

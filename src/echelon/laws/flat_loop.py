@@ -133,14 +133,14 @@ class FlatLoop(eqx.Module):
         Raises:
             LawError: the scale of the thrust is to be estimated, and the model has none.
         """
-        r, m = max(chains.degrees), len(chains.degrees)
-        weights, stiffness = np.zeros((r, m)), np.ones(m)
-        for k, degree in enumerate(chains.degrees):
-            q = np.atleast_1d(np.poly(-np.array(roots[: degree - 1])))[::-1]
-            weights[:degree, k], stiffness[k] = q / q[0], q[0]
+        weights, stiffness = chain_weights(chains.degrees, roots)
         thrust = thrust_of(model, chains) if observer.scale else None
         angles = angles_among(model, chains.outputs)
         return cls(chains, weights, stiffness, observer, thrust, angles)
+
+    def of_leader(self, path: jax.Array) -> jax.Array:
+        """Return a path (r + 1, m) in the outputs of the leader."""
+        return path
 
     # ---- memory ----
 
@@ -350,6 +350,15 @@ class FlatLoop(eqx.Module):
         first, second = jax.jvp(speed, (x,), (velocity(x),))
         at_once = np.array(self.chains.degrees) == 1
         return jnp.where(at_once, output(x), first), jnp.where(at_once, first, second)
+
+
+def chain_weights(degrees: tuple[int, ...], roots: tuple[float, ...]) -> tuple[Array, Array]:
+    """Return k_l / k0 (r, m) and k0 (m,) of q, of which a shorter chain takes the first roots."""
+    weights, stiffness = np.zeros((max(degrees), len(degrees))), np.ones(len(degrees))
+    for k, degree in enumerate(degrees):
+        q = np.atleast_1d(np.poly(-np.array(roots[: degree - 1])))[::-1]
+        weights[:degree, k], stiffness[k] = q / q[0], q[0]
+    return weights, stiffness
 
 
 def beside_turns(place: jax.Array, heading: jax.Array | None, angles: tuple[int, ...]) -> jax.Array:

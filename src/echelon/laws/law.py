@@ -91,12 +91,14 @@ class Law(Declared):
         leaderward: whether followers use messages of neighbours nearer to a leader alone.
         prover: the `Guarantee` of followers under the law, as `module:class`.
         turning: whether followers receive the heading that their leader follows.
+        unlike: whether agents under it may have different models.
         safety: how followers keep away from each other; None where they do not.
     """
 
     feedforward = Feedforward.NONE
     leaderward = False
     turning = False
+    unlike = False
     # Without an annotation, which would make it a field of every law.
     safety = cast("Safety | None", None)
     prover: ClassVar[str] = "echelon.guarantees.promises.metric_promise:MetricPromise"

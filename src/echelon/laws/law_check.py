@@ -8,11 +8,12 @@ import jax
 import jax.numpy as jnp
 
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.models.unlike import UnlikeAgents
 from echelon.agents.network.graph import Graph
 from echelon.agents.references.flatness import reference_warnings, stop_warnings
 from echelon.agents.references.reference import LeaderPath, Reference
 from echelon.core.cache import memoize
-from echelon.core.errors import LawError
+from echelon.core.errors import LawError, listing
 from echelon.core.numerics import precision
 from echelon.core.trace import check_array, checked_trace, form_in_words, form_of, place_of
 from echelon.core.types import PyTree
@@ -29,6 +30,11 @@ def prepare_law(law: Law, model: ControlAffine, graph: Graph) -> Law:
     Raises:
         LawError: it does not fit the model, or returns something else than the interface requires.
     """
+    if isinstance(model, UnlikeAgents) and not law.unlike:
+        raise LawError(
+            f"`{type(law).__name__}` is a law of agents of one model, and these are "
+            f"{listing(model.names)}; use `stopping-point` for leader and followers."
+        )
     with precision("float64"):
         complete = law.prepared(model, graph)
         if not isinstance(complete, Law):

@@ -320,7 +320,8 @@ class StoppingLeader(FlatLaw, Travels, Proves):
         """Return the flat outputs to follow with their derivatives, (r + 1, m)."""
         loop = self.ready
         if isinstance(self.reference, Reference):
-            return self.reference.derivatives(t, len(loop.weights), loop.chains.outputs)
+            path = self.reference.derivatives(t, len(loop.weights), loop.chains.outputs)
+            return loop.of_leader(path)
         there = model.output(jnp.asarray(np.asarray(model.trim[0], float), t.dtype))
         place = jnp.stack([there[model.output_names.index(name)] for name in loop.chains.outputs])
         return jnp.pad(place[None], ((0, len(loop.weights)), (0, 0)))

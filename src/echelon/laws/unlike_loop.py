@@ -2,7 +2,9 @@
 
 Agents agree on where they would come to rest in all outputs of all groups. An output that an agent
 does not have, such as the height of a rover, it carries for the others: as one integrator that
-moves at the rate that the law commands.
+moves at the rate that the law commands. An output whose chain is longer in another group follows
+what is commanded through a filter with the roots that its own chain lacks. So the same polynomial
+is between zeta and y in all groups, q(D) y' = k0 zeta', and agents that move keep their places.
 """
 
 from typing import TYPE_CHECKING, final
@@ -17,11 +19,14 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.unlike import UnlikeAgents
 from echelon.core.errors import LawError
 from echelon.core.types import Array, Input, Scalar, State
-from echelon.laws.flat_loop import FlatLoop, FlatMemory, Observer, beside_turns
+from echelon.laws.flat_loop import FlatLoop, FlatMemory, Observer, beside_turns, chain_weights
 from echelon.laws.law import LocalView
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+_INSTANT = 1e-12
+"""Of a root times the period; a shorter one is none."""
 
 
 @final
@@ -31,7 +36,9 @@ class UnlikeLoop(eqx.Module):
     Attributes:
         loops: of each group.
         chains: of all outputs and inputs: the longest of each.
-        weights, stiffness: of the leader's group, as in `FlatLoop`.
+        weights, stiffness: of the longest chains, as in `FlatLoop`.
+        roots: (r - 1,) of q, 1/s.
+        leading: the group of the leader.
         observer: of all.
         angles: which outputs are angles.
     """
@@ -40,34 +47,35 @@ class UnlikeLoop(eqx.Module):
     chains: Chains = eqx.field(static=True)
     weights: Array
     stiffness: Array
+    roots: tuple[float, ...] = eqx.field(static=True)
+    leading: int = eqx.field(static=True)
     observer: Observer = eqx.field(static=True)
     angles: tuple[int, ...] = eqx.field(static=True, default=())
 
     @classmethod
     def of(
-        cls, model: UnlikeAgents, loops: "Sequence[FlatLoop]", observer: Observer
+        cls, model: UnlikeAgents, loops: "Sequence[FlatLoop]", roots: tuple[float, ...]
     ) -> "UnlikeLoop":
-        """Return it of the loops of the groups.
+        """Return it of the loops of the groups, of which the longest has all roots (1/s).
 
         Raises:
             LawError: the scale of the thrust is to be estimated.
         """
+        observer, degrees, angles = loops[0].observer, dict[str, int](), dict[str, None]()
         if observer.scale:
             raise LawError("got `scale` of the observer for unlike agents, allowed is 0.")
-        outputs = tuple(dict.fromkeys(name for loop in loops for name in loop.chains.outputs))
-        degrees, angles = dict.fromkeys(outputs, 1), set[int]()
         for loop in loops:
-            for name, degree in zip(loop.chains.outputs, loop.chains.degrees, strict=True):
-                degrees[name] = max(degrees[name], degree)
-            angles |= {outputs.index(loop.chains.outputs[k]) for k in loop.angles}
+            names = loop.chains.outputs
+            for name, degree in zip(names, loop.chains.degrees, strict=True):
+                degrees[name] = max(degrees.get(name, 1), degree)
+            angles |= dict.fromkeys(names[k] for k in loop.angles)
+        outputs = tuple(degrees)
         integrators = sum((tuple(loop.chains.integrators) for loop in loops), start=())
         chains = Chains(outputs, tuple(degrees.values()), integrators)
-        first = loops[model.own_kind]
-        weights = np.zeros((max(degrees.values()), len(outputs)))
-        weights[0], stiffness = 1.0, np.ones(len(outputs))
-        at = [outputs.index(name) for name in first.chains.outputs]
-        weights[: len(first.weights), at], stiffness[at] = first.weights, first.stiffness
-        return cls(tuple(loops), chains, weights, stiffness, observer, tuple(sorted(angles)))
+        weights, stiffness = chain_weights(chains.degrees, roots)
+        turning = tuple(sorted(map(outputs.index, angles)))
+        rest = roots, model.own_kind, observer, turning
+        return cls(tuple(loops), chains, weights, stiffness, *rest)
 
     # ---- whose is what ----
 
@@ -78,6 +86,22 @@ class UnlikeLoop(eqx.Module):
     def ahead_of(self, kind: int, ahead: jax.Array | Array) -> jax.Array | Array:
         """Return what is ahead, (r, m), in the outputs of a group."""
         return ahead[: len(self.loops[kind].weights), self.outputs_of(kind)]
+
+    def filters_of(self, kind: int) -> Array:
+        """Return which roots (r - 1, m) an output's own chain lacks; none of what it carries."""
+        rows, at = np.arange(len(self.roots))[:, None], self.outputs_of(kind)
+        whole, lacks = (
+            np.array(self.chains.degrees),
+            np.zeros((len(rows), len(self.stiffness)), bool),
+        )
+        own = np.array(self.loops[kind].chains.degrees)
+        lacks[:, at] = (rows >= own - 1) & (rows < whole[at] - 1)
+        return lacks
+
+    def of_leader(self, path: jax.Array) -> jax.Array:
+        """Return a path (r + 1, m), which stays at 0 in outputs that the leader does not have."""
+        has = np.isin(np.arange(path.shape[1]), self.outputs_of(self.leading))
+        return jnp.where(has, path, 0.0)
 
     def _chain_of(self, kind: int) -> slice:
         ends = np.cumsum([0, *(loop.chains.size for loop in self.loops)]).tolist()
@@ -123,53 +147,78 @@ class UnlikeLoop(eqx.Module):
         """Return a memory of zeros."""
         zero, inputs = jnp.zeros(len(self.stiffness)), jnp.zeros(len(self.chains.integrators))
         memory = jnp.zeros(self.chains.size), zero, inputs, zero, zero, jnp.zeros(())
-        return self.beside(FlatMemory(*memory, carried=zero), zero)
+        carried = jnp.zeros((1 + len(self.roots), len(zero)))
+        return self.beside(FlatMemory(*memory, carried=carried), zero)
 
     def begin(self, model: ControlAffine, x: State, ahead: jax.Array) -> FlatMemory:
         """Return the memory of an agent that begins at x, with what is ahead (r, m)."""
         assert isinstance(model, UnlikeAgents)
-        each, places = list[FlatMemory](), list[jax.Array]()
+        each, filters = list[FlatMemory](), list[jax.Array]()
         for k, loop in enumerate(self.loops):
-            own, part = model.models[k], model.part(k, x)
-            mine = self.ahead_of(k, ahead)
-            e = initial_integrators(own, loop.chains, part, jnp.asarray(mine))
+            own, part, mine = model.models[k], model.part(k, x), self.ahead_of(k, ahead)
+            e = initial_integrators(own, loop.chains, part, mine)
             each.append(loop.initial_memory(own, part, e))
-            places.append(ahead[0].at[self.outputs_of(k)].set(loop.stop(jnp.asarray(mine))))
-        carried = model.output(x)[self._among(model)]
-        memory = self.zero_memory()._replace(carried=carried.astype(x.dtype))
-        memory = jax.tree.map(lambda leaf: leaf.astype(x.dtype), memory)
-        return self.beside(self._with(model, x, each, memory), model.chosen(x, places))
+            filters.append(self._level(k, ahead))
+        has = model.output(x)[np.array([model.output_names.index(y) for y in self.chains.outputs])]
+        carried = jnp.concatenate([has[None], model.chosen(x, filters)])
+        memory = self.zero_memory()._replace(carried=carried)
+        memory = self._with(model, x, each, jax.tree.map(lambda y: y.astype(x.dtype), memory))
+        return self.beside(memory, self.stop(ahead))
+
+    def _level(self, kind: int, ahead: jax.Array) -> jax.Array:
+        """Return the filters (r - 1, m) of an agent that moves along what is ahead (r, m)."""
+        lacks, speeds = self.filters_of(kind), jnp.concatenate([ahead[1:], 0.0 * ahead[:1]])
+        own, at, rows = self.loops[kind], self.outputs_of(kind), list[jax.Array]()
+        weights = jnp.zeros(self.weights.shape).at[0].set(1.0)
+        weights = weights.at[: len(own.weights), at].set(own.weights)
+        for row, root in zip(lacks, self.roots, strict=True):
+            rows.append(jnp.where(row, (weights * speeds).sum(axis=0), 0.0))
+            # (D / root + 1) q(D), of which one more derivative is taken.
+            later = jnp.concatenate([0.0 * weights[:1], weights[:-1] / root])
+            weights = jnp.where(row, weights + later, weights)
+        return jnp.stack(rows) if rows else 0.0 * ahead[:0]
 
     def beside(self, memory: FlatMemory, place: jax.Array) -> FlatMemory:
         """Return the memory of an agent that takes its angles next to those of a place (m,)."""
         angles = np.array(self.angles, int)
         return memory._replace(heading=place[angles]) if self.angles else memory
 
-    def _among(self, model: UnlikeAgents) -> Array:
-        return np.array([model.output_names.index(name) for name in self.chains.outputs])
-
     # ---- coordinates ----
 
     def stop(self, values: jax.Array) -> jax.Array:
-        """Return zeta (m,) of flat coordinates (r, m) of the leader's group."""
+        """Return zeta (m,) of flat coordinates (r, m) by the longest chains."""
         return (jnp.asarray(self.weights, values.dtype) * values).sum(axis=0)
 
     def place(self, model: ControlAffine, x: State, offset: State, memory: FlatMemory) -> jax.Array:
         """Return zeta less the offset, (m,): where the agent would come to rest."""
         assert isinstance(model, UnlikeAgents) and memory.carried is not None
-        carried, each = memory.carried - self._carried_offset(model, offset), list[jax.Array]()
+        names, each, stages = model.state_names, list[jax.Array](), memory.carried[1:]
+        known = [offset[names.index(y)] if y in names else 0.0 * x[0] for y in self.chains.outputs]
+        carried = memory.carried[0] - jnp.stack(known)
         for k, loop in enumerate(self.loops):
-            own, mine = model.models[k], self._memory_of(model, k, memory)
-            part = model.part(k, x)
-            place = loop.stop(loop.flat_values(own, part, mine))
+            own, part = model.models[k], model.part(k, x)
+            place = loop.stop(loop.flat_values(own, part, self._memory_of(model, k, memory)))
             place = place - loop.shift(own, offset[model.states_of(k)])
-            each.append(carried.at[self.outputs_of(k)].set(place))
+            roots = np.array(self.roots)[:, None]
+            ahead = jnp.where(self.filters_of(k), stages / roots, 0.0).sum(axis=0)
+            at = self.outputs_of(k)
+            each.append(carried.at[at].set(place + ahead[at]))
         return beside_turns(model.chosen(x, each), memory.heading, self.angles)
 
-    def _carried_offset(self, model: UnlikeAgents, offset: State) -> jax.Array:
-        names = model.state_names
-        own = [offset[names.index(x)] if x in names else 0.0 for x in self.chains.outputs]
-        return jnp.asarray(own, offset.dtype) if not own else jnp.stack(list(map(jnp.asarray, own)))
+    def _filtered(
+        self, kind: int, rate: jax.Array, stages: jax.Array, period: Scalar | float
+    ) -> tuple[jax.Array, jax.Array]:
+        """Return the mean of a rate (m,) behind the filters of a group, and their states after.
+
+        Each is w' = root (v - w) with v held, so that zeta moves by the rate times the period.
+        """
+        lacks, after = self.filters_of(kind), list[jax.Array]()
+        for row, root, w in reversed(list(zip(lacks, self.roots, stages, strict=True))):
+            left = jnp.exp(-root * period)
+            mean = rate + (w - rate) * (1.0 - left) / jnp.maximum(root * period, _INSTANT)
+            after.append(jnp.where(row, rate + (w - rate) * left, 0.0))
+            rate = jnp.where(row, mean, rate)
+        return rate, jnp.stack(after[::-1]) if after else stages
 
     # ---- a step ----
 
@@ -183,17 +232,20 @@ class UnlikeLoop(eqx.Module):
     ) -> tuple[Input, FlatMemory]:
         """Return the physical input that makes zeta move at a rate (m,), and the next memory."""
         assert isinstance(model, UnlikeAgents) and memory.carried is not None
-        inputs, each, place = list[Input](), list[FlatMemory](), None
+        inputs, each, filters = list[Input](), list[FlatMemory](), list[jax.Array]()
         none = jnp.zeros(len(model.input_names), view.x.dtype)
         for k, loop in enumerate(self.loops):
             offset = view.offset[model.states_of(k)]
             own = eqx.tree_at(lambda v: (v.x, v.offset), view, (model.part(k, view.x), offset))
             mine = self._memory_of(model, k, memory)
-            u, mine = loop.obey(model.models[k], own, rate[self.outputs_of(k)], mine)
+            passed, after = self._filtered(k, rate, memory.carried[1:], view.period)
+            u, mine = loop.obey(model.models[k], own, passed[self.outputs_of(k)], mine)
+            filters.append(after)
             inputs.append(none.at[model.inputs_of(k)].set(u))
             each.append(mine)
         place = self.place(model, view.x, view.offset, memory)
-        carried = memory.carried + view.period * rate
+        held = memory.carried[:1] + view.period * rate
+        carried = jnp.concatenate([held, model.chosen(view.x, filters)])
         memory = self.beside(memory._replace(rate=rate, carried=carried), place)
         return model.chosen(view.x, inputs), self._with(model, view.x, each, memory)
 

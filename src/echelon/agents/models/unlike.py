@@ -115,8 +115,48 @@ class UnlikeAgents(ControlAffine):
         return rest
 
     def with_kinds(self, offsets: Array) -> Array:
-        """Return offsets (N, n) with those between the groups of agents and of the leader."""
+        """Return offsets (N, n) with those between the groups of agents and of the leader.
+
+        Raises:
+            ModelError: there are more or fewer agents, or one has an offset in a coordinate that
+                neither it nor the leader has.
+        """
+        self.check_count(len(offsets))
+        for agent, kind in enumerate(self.kinds):
+            for name in {*self.position} - {*self.models[kind].position}:
+                own = offsets[agent, self.state_names.index(name)]
+                if own and name not in self.models[self.own_kind].position:
+                    raise ModelError(
+                        f"agent {agent}, a `{self.names[kind]}`, has no `{name}`, and its offset "
+                        f"there is {own:g}; allowed is 0."
+                    )
         return np.column_stack([offsets[:, :-1], np.array(self.kinds, float) - self.own_kind])
+
+    def start_of(self, agent: int, state: Sequence[float]) -> Array:
+        """Return the start (n,) of an agent from the states of its group.
+
+        Raises:
+            ModelError: they are not as many as the group has.
+        """
+        if not 0 <= agent < len(self.kinds):
+            return np.asarray(state, float)
+        kind = self.kinds[agent]
+        names = self.models[kind].state_names
+        if len(state) != len(names):
+            raise ModelError(
+                f"the initial state of agent {agent} has {len(state)} numbers, and `"
+                f"{self.names[kind]}` has {len(names)} states, {listing(names)}."
+            )
+        whole = np.array(self.trim[0], float)
+        whole[self.states_of(kind)], whole[-1] = state, kind
+        return whole
+
+    def check_count(self, agents: int) -> None:
+        """Raise `ModelError` unless the groups have so many agents in all."""
+        if agents != len(self.kinds):
+            raise ModelError(
+                f"the groups have {len(self.kinds)} agents in all, and the graph {agents}."
+            )
 
     def in_words(self) -> str:
         """Return which agents are of which group."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
+from echelon.agents.models.unlike import UnlikeAgents
 from echelon.agents.network.channel import Bursts, Network
 from echelon.agents.network.events import Cut, Event, Join, Lose, check_backups, event_faults
 from echelon.agents.network.formation import Formation
@@ -58,6 +59,7 @@ from echelon.experiments.scenario.sections import (
     GainSpec,
     GraphSpec,
     LeaderSpec,
+    ModelSpec,
     MotionSpec,
     PlantSpec,
     ShapeKeys,
@@ -163,10 +165,14 @@ class _Builder:
         self.settings = self.part(
             lambda: Settings(**numbers, seed=scenario.seed, steady_window=window), "simulation"
         )
-        self.model = self.part(self._model, "model")
+        self.model = self.part(self._agents, "agents" if scenario.agents else "model")
         self.graph = self.part(lambda: _graph(scenario.graph, scenario.folder), "graph")
         self.reference = self.part(self._reference, "reference")
         self.settle()
+        if isinstance(self.model, UnlikeAgents):
+            with self.at("agents"):
+                self.model.check_count(self.graph.agents)
+            self.settle()
 
     @contextlib.contextmanager
     def at(self, *path: str | int) -> Iterator[None]:
@@ -218,7 +224,7 @@ class _Builder:
                     model.states_called(name)
         self.settle()
         # Spreads by state or group, and states by agent: these are different keys.
-        initial: Any = dict(spread) | dict(scenario.initial.states or {})
+        initial: Any = dict(spread) | self._starts()
         laws = Laws(cast(Law, leader), cast(Law, follower))
         parts = Parts(
             *(model, self.graph, formation, laws),
@@ -243,6 +249,13 @@ class _Builder:
 
     # ---- agents and formation ----
 
+    def _starts(self) -> dict[int, Any]:
+        """Return the given starts by agent; of unlike agents each by the states of its group."""
+        given, model = self.scenario.initial.states or {}, self.model
+        if not isinstance(model, UnlikeAgents):
+            return dict(given)
+        return {agent: model.start_of(agent, state) for agent, state in given.items()}
+
     def _class(
         self,
         kind: type,
@@ -256,8 +269,23 @@ class _Builder:
             return NamedClass(cls, python, arguments, by_user=True)
         return NamedClass(resolve(table[str(name)]), str(name), arguments, by_user=False)
 
-    def _model(self) -> ControlAffine:
-        spec = self.scenario.model
+    def _agents(self) -> ControlAffine:
+        """Return the model of all agents, or of all groups of unlike ones."""
+        scenario, groups = self.scenario, list[tuple[str, int, ControlAffine]]()
+        if scenario.agents is None:
+            return self._model(cast(ModelSpec, scenario.model))
+        for k, group in enumerate(scenario.agents):
+            with self.at("agents", k, "model"):
+                name = group.name or group.model.name or str(group.model.python).partition(":")[2]
+                groups.append((name, group.count, self._model(group.model)))
+        # A fault of a group is noted, and of the others nothing else is said.
+        self.settle()
+        total, leader = sum(group.count for group in scenario.agents), scenario.graph.leaders[0]
+        model = UnlikeAgents.of(groups, leader if leader < total else 0)
+        check_model(model)
+        return model
+
+    def _model(self, spec: ModelSpec) -> ControlAffine:
         part = self._class(ControlAffine, registry.MODELS, spec.name, spec.python)
         extra = {"allow_unphysical": True} if spec.allow_unphysical else {}
         if extra and "allow_unphysical" not in accepted(part.cls):
@@ -306,7 +334,7 @@ class _Builder:
 
     def _nearest(self, formation: Formation) -> Formation:
         """Return a formation whose places are exchanged by `assign: nearest`."""
-        starts = self.scenario.initial.states
+        starts = self._starts()
         if not starts:
             raise FormationError(
                 "`assign: nearest` needs `initial.states`: without them agents start about "
@@ -338,7 +366,7 @@ class _Builder:
                     "`assign: nearest` exchanges places, and `distances` are of agents by number."
                 )
             n = len(self.model.state_names)
-            axes, starts = list(self.model.position_indices()), self.scenario.initial.states or {}
+            axes, starts = list(self.model.position_indices()), self._starts()
             whole = [starts.get(k, ()) for k in range(self.graph.agents)]
             known = all(len(state) == n for state in whole)
             near = np.array(whole, float)[:, axes] if known else None
@@ -481,6 +509,10 @@ class _Builder:
         spec = self.scenario.plant
         if spec is None:
             return None, {}
+        if isinstance(self.model, UnlikeAgents):
+            with self.at("plant"):
+                text = "`plant` is of agents of one model; give groups other `parameters`"
+                raise ModelError(f"{text} under `agents`.")
 
         def varied(part: VariationSpec | PlantSpec) -> ControlAffine:
             plant = vary_parameters(self.model, part.parameters, part.scale)

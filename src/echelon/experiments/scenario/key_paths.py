@@ -22,7 +22,6 @@ _COMMON_NAMES = {
     "initial": "start starts initial_states x0",
     "graph": "topology",
     "graph.edges": "links",
-    "graph.agents": "agents",
     "formation.name": "shape",
     "reference": "path trajectory waypoints",
     "follower.law": "controller control law",

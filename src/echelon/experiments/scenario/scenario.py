@@ -7,7 +7,7 @@ import copy
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, TypeAlias, final
+from typing import Annotated, Any, ClassVar, NoReturn, TypeAlias, final
 
 from pydantic import Field, PrivateAttr, ValidationError
 from pydantic_core import ErrorDetails
@@ -17,7 +17,14 @@ from echelon.core.gone import VALUES, gone, gone_key
 from echelon.core.limits import LARGEST
 from echelon.experiments.scenario import registry, sections
 from echelon.experiments.scenario.key_paths import key_paths, meant, sections_in
-from echelon.experiments.scenario.values import Finding, FolderName, Section, Seed, foreign_keys
+from echelon.experiments.scenario.values import (
+    Finding,
+    FolderName,
+    Section,
+    Seed,
+    either,
+    foreign_keys,
+)
 from echelon.experiments.scenario.yaml import (
     Document,
     KeyPath,
@@ -40,12 +47,16 @@ SCENARIO_FILE = "scenario.yaml"
 
 
 @final
-class Scenario(Section):
+class Scenario(Section, **either("model", "agents")):
     """One experiment, checked and with its defaults; `load_scenario` returns one."""
 
     name: FolderName
     """Name of its folder."""
-    model: sections.ModelSpec
+    one_of: ClassVar = ("model", "agents")
+    model: sections.ModelSpec | None = None
+    agents: Annotated[tuple[sections.GroupSpec, ...] | None, Field(strict=False)] = None
+    """Groups of unlike agents in place of `model`, as in `[{count: 1, model: double-integrator},
+    {count: 3, model: quadrotor}]`; the law is `stopping-point`."""
     plant: sections.PlantSpec | None = None
     graph: sections.GraphSpec
     formation: sections.FormationSpec = Field(default_factory=sections.FormationSpec)
@@ -77,6 +88,7 @@ class Scenario(Section):
 
     def faults(self) -> Iterator[Finding]:
         """Yield a leader's law that lacks its reference, and a reference that it does not take."""
+        yield from super().faults()
         law, reference = self.leader.law, self.reference
         entry = registry.LEADER_LAWS.get(law) if isinstance(law, str) else None
         if entry is not None and entry.reference == "needed" and reference is None:

@@ -10,7 +10,7 @@ import abc
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, ClassVar, final
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from echelon.core.limits import horizon_fault
 from echelon.core.words import (
@@ -70,6 +70,22 @@ class ModelSpec(Section, **either("name", "python")):
     and the step `Ts` of a discrete-time model."""
     allow_unphysical: bool = False
     """Whether parameters that no rigid body can have are accepted."""
+
+
+def _named(model: object) -> object:
+    return {"name": model} if isinstance(model, str) else model
+
+
+@final
+class GroupSpec(Section):
+    """A group of agents of one model, in a formation of unlike agents."""
+
+    count: Count
+    """How many they are; agents are numbered from 0, one group after another."""
+    model: Annotated[ModelSpec, BeforeValidator(_named, json_schema_input_type=str | ModelSpec)]
+    """The model of the group: the name of a bundled one, or the keys of `model`."""
+    name: str | None = None
+    """Name of the group, with which its inputs begin; default that of the model."""
 
 
 @final

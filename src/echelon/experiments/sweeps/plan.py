@@ -31,7 +31,7 @@ WORDS = (
     *("engine", "warnings", UNIT),
 )
 """The columns of each run: numbers of it, numbers of its agents, and texts."""
-_SHAPING = ("model", "graph", "simulation")
+_SHAPING = ("model", "agents", "graph", "simulation")
 """The sections on which agents, states and times of a run depend."""
 StoredFrames: TypeAlias = "Mapping[str, Array]"
 """`states` (runs, T, N, n) and `inputs` (runs, T, N, m); NaN where a run has none."""
