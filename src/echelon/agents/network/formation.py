@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.models.unlike import UnlikeAgents
 from echelon.agents.network.distance_shapes import Distances, realize, rigidity_matrix
 from echelon.agents.network.formation_motion import (
     FormationMotion,
@@ -322,6 +323,8 @@ class Formation:
             lower: lower bounds of the states, (n,) or one for all, as deviations from the trim.
             upper: upper bounds.
         """
+        if isinstance(model, UnlikeAgents):
+            return self._broken_of_groups(model, lower, upper)
         offsets = self.offsets - self.offsets[0] + 0.0  # turns -0.0 into 0.0
         first, group = _distinct(offsets)
         tested = range(0, len(first), max(1, -(-len(first) // _MAX_TESTED)))
@@ -335,6 +338,19 @@ class Formation:
         reasons = {k: reason for k, reason in changes.items() if reason}
         agents = np.flatnonzero(np.isin(group, [*reasons])) if reasons else np.zeros(0, int)
         return {agent: reasons[int(group[agent])] for agent in agents.tolist()}
+
+    def _broken_of_groups(
+        self, model: UnlikeAgents, lower: Array | float, upper: Array | float
+    ) -> dict[int, str]:
+        """Return the same of unlike agents, each offset among the states of its own group."""
+        broken = dict[int, str]()
+        for kind, part in enumerate(model.models):
+            at, mine = model.states_of(kind), np.flatnonzero(np.array(model.kinds) == kind)
+            own = Formation(self.offsets[np.append(0, mine)][:, at])
+            bounds = (x if np.ndim(x) == 0 else np.asarray(x)[at] for x in (lower, upper))
+            found = own.broken_symmetries(part, *bounds)
+            broken |= {int(mine[k - 1]): why for k, why in found.items() if k}
+        return dict(sorted(broken.items()))
 
     def is_invariant(self, model: ControlAffine) -> bool:
         """Tell whether every offset is a symmetry of the model, by the sampled test above."""

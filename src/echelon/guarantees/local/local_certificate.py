@@ -71,6 +71,7 @@ class Fault(enum.StrEnum):
     """Why nothing is known near rest."""
 
     NO_REST = "agents do not stay where they rest"
+    SINGULAR = "a step of agents at rest gives no finite numbers"
     OFF_GOALS = "agents rest off their goals"
     TIME = "the step depends on time"
     WHOLE = "the step depends on whole numbers that it remembers"
@@ -618,6 +619,8 @@ def _judged(
     rest: _Rest, goals: Array, period: int, names: tuple[str, ...], foreign: bool
 ) -> LocalCertificate:
     """Return the certificate of what rests; `foreign`: whether a user's own code takes part."""
+    if not np.isfinite(reals(rest.now)).all():
+        return LocalCertificate((Fault.SINGULAR,))
     if not (rest.residual <= _AT_REST and _arrives(rest, period)):
         return LocalCertificate((Fault.NO_REST,))
     states, agents = rest.body.state[rest.free], rest.body.agent[rest.free]

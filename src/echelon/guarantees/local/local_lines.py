@@ -63,6 +63,10 @@ def _rests(parts: Parts, local: LocalCertificate) -> Statement:
         text = f"the step depends on where agents are: shifted as the trim moves, {local.culprit}"
         remedy = "let laws use differences of positions alone"
         return fails(name, _LINEAR, text, remedy=remedy, reason=text)
+    if Fault.SINGULAR in local.faults:
+        text = "agents at rest at their goals have no finite input or message in the steps that run"
+        remedy = "use models and laws with finite inputs at rest"
+        return fails(name, _LINEAR, text, remedy=remedy, reason=text)
     if Fault.NO_REST in local.faults:
         text = "agents at their goals do not stay there, and no place was found where they rest"
         remedy = "let the law return the trim input where nothing disagrees"
@@ -132,7 +136,7 @@ def _decays(parts: Parts, settings: Settings, local: LocalCertificate, shorter: 
 
 
 _TOLD = {Fault.TIME, Fault.WHOLE, Fault.SWITCHES, Fault.PLACES}
-_TOLD |= {Fault.NO_REST, Fault.OFF_GOALS, Fault.KINK}
+_TOLD |= {Fault.SINGULAR, Fault.NO_REST, Fault.OFF_GOALS, Fault.KINK}
 """What other lines tell."""
 
 
