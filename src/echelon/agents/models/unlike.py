@@ -161,7 +161,7 @@ class UnlikeAgents(ControlAffine):
     def in_words(self) -> str:
         """Return which agents are of which group."""
         return ", ".join(
-            f"{name}: {_range(np.flatnonzero(np.array(self.kinds) == k))}"
+            f"{name} {_range(np.flatnonzero(np.array(self.kinds) == k))}"
             for k, name in enumerate(self.names)
         )
 
@@ -320,6 +320,16 @@ class UnlikeAgents(ControlAffine):
         return self.whole(kind, x), rest.at[self.inputs_of(kind)].set(u)
 
 
+def title_of(model: ControlAffine) -> str:
+    """Return the name of a model, of unlike agents which agents are of which group."""
+    return model.in_words() if isinstance(model, UnlikeAgents) else type(model).__name__
+
+
+def group_of(model: ControlAffine, agent: int) -> str:
+    """Return the group of an agent; empty where all agents are alike."""
+    return model.names[model.kinds[agent]] if isinstance(model, UnlikeAgents) else ""
+
+
 def _none(model: ControlAffine) -> Limits:
     m = len(model.input_names)
     return Limits(tuple(map(tuple, np.eye(m).tolist())), (-np.inf,) * m, (np.inf,) * m)
@@ -335,8 +345,8 @@ def _blocks(parts: list[Array]) -> Rows:
 
 
 def _range(agents: Array) -> str:
-    """Return numbers of agents in words, as in `1 to 3`."""
+    """Return numbers of neighbouring agents in words, as in `1 to 3`."""
     first, last = int(agents[0]), int(agents[-1])
     if last - first + 1 == len(agents) > 2:
         return f"{first} to {last}"
-    return listing(str(agent) for agent in agents.tolist())
+    return " and ".join(map(str, agents.tolist()))

@@ -9,6 +9,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from echelon.agents.models.unlike import UnlikeAgents, title_of
 from echelon.core.errors import check_kind
 from echelon.core.files import write_atomic
 from echelon.core.types import JsonObject, PathLike
@@ -249,7 +250,8 @@ def _attributes_of_parts(parts: Parts, settings: Settings) -> JsonObject:
             f"{role}_needs": "; ".join(received) or "nothing"
             for role, received in parts.information._asdict().items()
         },
-        "model": type(model).__name__,
+        "model": title_of(model),
+        **({"groups": "; ".join(model.names)} if isinstance(model, UnlikeAgents) else {}),
         "position": " ".join(model.position),
         "directed": int(parts.graph.directed),
         "format": FORMAT,

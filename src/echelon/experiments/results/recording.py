@@ -282,6 +282,12 @@ def read_recording(file: Path) -> tuple[Recording, Labelled]:
         ) from error
 
 
+def group_name(run: Recording, agent: int) -> str:
+    """Return the name of an agent's group, which its last state says; empty where all are alike."""
+    names = str(run.attributes.get("groups", "")).split("; ")
+    return names[round(run.states[0, agent, -1])] if names[0] else ""
+
+
 def recording(arrays: Mapping[str, np.ndarray], attributes: JsonObject) -> Recording:
     """Return a run from the arrays and the attributes of its dataset.
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from echelon.core.errors import OutputError
 from echelon.core.types import Array
-from echelon.experiments.results.recording import Recording
+from echelon.experiments.results.recording import Recording, group_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -183,11 +183,16 @@ def name_of(run: Recording, agent: int, short: bool = False) -> str | None:
     leaders, few = run.leaders, run.agents <= NAMED
     if agent in leaders:
         if not short or few or len(leaders) <= NAMED:
-            return f"leader {agent}"
+            return _with_group(run, f"leader {agent}", agent)
         return f"{len(leaders)} leaders" if agent == leaders[0] else None
     if few or not short:
-        return f"follower {agent}"
+        return _with_group(run, f"follower {agent}", agent)
     return f"{len(run.followers)} followers" if agent == run.followers[0] else None
+
+
+def _with_group(run: Recording, name: str, agent: int) -> str:
+    group = group_name(run, agent)
+    return f"{name}, {group}" if group else name
 
 
 def leaders_first(run: Recording, agents: Iterable[int]) -> list[int]:

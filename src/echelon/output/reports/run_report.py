@@ -12,6 +12,8 @@ import numpy as np
 from jaxtyping import Bool
 
 from echelon import __version__
+from echelon.agents.models.model import ControlAffine
+from echelon.agents.models.unlike import group_of, title_of
 from echelon.agents.network.hearing import who_hears_whom
 from echelon.core.digits import at_least
 from echelon.core.errors import Outcome
@@ -196,7 +198,7 @@ def _table(result: Result, numbers: Metrics) -> "Table":
         "settled": settling_bound(result.length_unit),
     }
     columns = ["agent", *(quantity.column.format(**texts) for quantity in _COLUMNS.values())]
-    agents = f"{result.graph.agents} x {type(result.model).__name__}"
+    agents = f"{result.graph.agents} x {title_of(result.model)}"
     name = result.provenance.get("scenario") or agents
     end = result.times[-1] if len(result.times) else 0.0
     part = "" if result.outcome.reached else f"{end:g} s of "
@@ -205,17 +207,22 @@ def _table(result: Result, numbers: Metrics) -> "Table":
     table.show_edge = False
     for column in columns:
         table.add_column(column, justify="left" if column == "agent" else "right", no_wrap=True)
-    for row in _rows(numbers):
+    for row in _rows(numbers, result.model):
         table.add_row(*row)
     return table
 
 
-def _rows(numbers: Metrics) -> list[list[str]]:
+def _rows(numbers: Metrics, model: ControlAffine) -> list[list[str]]:
     leaders, followers = numbers.leaders, numbers.followers
     # A single leader needs no number, as in the paper's table.
     names = ["leader"] if len(leaders) == 1 else None
     agents = [*labelled("leader", leaders, names), *labelled("follower", followers)]
-    return [[label, *(_cell(numbers, name) for name in _COLUMNS)] for label, numbers in agents]
+    rows = list[list[str]]()
+    for label, own in agents:
+        group = group_of(model, own.agent)
+        cells = (_cell(own, name) for name in _COLUMNS)
+        rows.append([f"{label}, {group}" if group else label, *cells])
+    return rows
 
 
 _Row = TypeVar("_Row", LeaderMetrics, FollowerMetrics)

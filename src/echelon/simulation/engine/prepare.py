@@ -11,6 +11,7 @@ from echelon.agents.models.linearization import at_trim
 from echelon.agents.models.model import ControlAffine, position_unit
 from echelon.agents.models.model_check import check_model
 from echelon.agents.models.relative_equilibrium import moves, path_states, separation
+from echelon.agents.models.unlike import group_of, title_of
 from echelon.agents.network.channel import Channel
 from echelon.agents.network.events import event_faults
 from echelon.agents.network.formation import Formation
@@ -245,7 +246,8 @@ def _goals(model: ControlAffine, formation: Formation) -> Iterator[str]:
     # One warning is enough: the other offsets mostly break the same symmetry.
     for agent, reason in list(broken.items())[:1]:
         yield (
-            f"the offset of agent {agent} is no symmetry of `{type(model).__name__}`: {reason}, "
+            f"the offset of agent {agent} is no symmetry of "
+            f"`{group_of(model, agent) or title_of(model)}`: {reason}, "
             "so the agents settle off their goals."
         )
     if not model.position:
