@@ -220,9 +220,14 @@ class FlatLaw(Law, Speaks, Feeds, KeepsApart, Checks):
         """Return zeta (m,) of a leader that moves on at the rate zeta' that it sent."""
         return signal + time * feedforward[: len(signal)]
 
-    def initial_memory(self, model: ControlAffine, x: State, ahead: jax.Array) -> FlatMemory:
-        """Return the memory of an agent that begins at x, with the derivatives of its reference."""
-        return self._counting(self.ready.begin(model, x, ahead))
+    def initial_memory(
+        self, model: ControlAffine, x: State, ahead: jax.Array, moves: bool = False
+    ) -> FlatMemory:
+        """Return the memory of an agent that begins at x, with the derivatives of its reference.
+
+        `moves`: whether it moves along the reference.
+        """
+        return self._counting(self.ready.begin(model, x, ahead, moves))
 
     def beside(self, memory: FlatMemory, signal: jax.Array) -> FlatMemory:
         """Return the memory of an agent that begins late, its heading next to that of a signal."""

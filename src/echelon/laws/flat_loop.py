@@ -144,7 +144,9 @@ class FlatLoop(eqx.Module):
 
     # ---- memory ----
 
-    def begin(self, model: ControlAffine, x: State, ahead: jax.Array) -> FlatMemory:
+    def begin(
+        self, model: ControlAffine, x: State, ahead: jax.Array, moves: bool = False
+    ) -> FlatMemory:
         """Return the memory of an agent that begins at x, with what is ahead (r, m)."""
         memory = self.initial_memory(model, x, initial_integrators(model, self.chains, x, ahead))
         # All take the turn that is next to one heading, so that it is a number like any other (T5).

@@ -357,7 +357,7 @@ class StoppingLeader(FlatLaw, Travels, Proves):
 
     def begin(self, model: ControlAffine, x: State) -> FlatMemory:
         """Return the memory of a leader that begins at x, as level as its path."""
-        return self.initial_memory(model, x, self.begins(model).astype(x.dtype))
+        return self.initial_memory(model, x, self.begins(model).astype(x.dtype), moves=True)
 
     def strength(self, period: Scalar | float) -> Scalar | float:
         """Return c where inputs are held for a period (s)."""

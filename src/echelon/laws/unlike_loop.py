@@ -150,17 +150,23 @@ class UnlikeLoop(eqx.Module):
         carried = jnp.zeros((1 + len(self.roots), len(zero)))
         return self.beside(FlatMemory(*memory, carried=carried), zero)
 
-    def begin(self, model: ControlAffine, x: State, ahead: jax.Array) -> FlatMemory:
-        """Return the memory of an agent that begins at x, with what is ahead (r, m)."""
+    def begin(
+        self, model: ControlAffine, x: State, ahead: jax.Array, moves: bool = False
+    ) -> FlatMemory:
+        """Return the memory of an agent that begins at x, with what is ahead (r, m).
+
+        Filters begin at rest, unless the agent moves along what is ahead.
+        """
         assert isinstance(model, UnlikeAgents)
         each, filters = list[FlatMemory](), list[jax.Array]()
         for k, loop in enumerate(self.loops):
             own, part, mine = model.models[k], model.part(k, x), self.ahead_of(k, ahead)
             e = initial_integrators(own, loop.chains, part, mine)
             each.append(loop.initial_memory(own, part, e))
-            filters.append(self._level(k, ahead))
-        has = model.output(x)[np.array([model.output_names.index(y) for y in self.chains.outputs])]
-        carried = jnp.concatenate([has[None], model.chosen(x, filters)])
+            level = self._level(k, ahead)
+            filters.append(level if moves else jnp.zeros_like(level))
+        # What it does not have begins at 0, where `output` has it too.
+        carried = jnp.pad(model.chosen(x, filters), ((1, 0), (0, 0)))
         memory = self.zero_memory()._replace(carried=carried)
         memory = self._with(model, x, each, jax.tree.map(lambda y: y.astype(x.dtype), memory))
         return self.beside(memory, self.stop(ahead))
@@ -232,7 +238,7 @@ class UnlikeLoop(eqx.Module):
     ) -> tuple[Input, FlatMemory]:
         """Return the physical input that makes zeta move at a rate (m,), and the next memory."""
         assert isinstance(model, UnlikeAgents) and memory.carried is not None
-        inputs, each, filters = list[Input](), list[FlatMemory](), list[jax.Array]()
+        inputs, each, stages = list[Input](), list[FlatMemory](), list[jax.Array]()
         none = jnp.zeros(len(model.input_names), view.x.dtype)
         for k, loop in enumerate(self.loops):
             offset = view.offset[model.states_of(k)]
@@ -240,12 +246,12 @@ class UnlikeLoop(eqx.Module):
             mine = self._memory_of(model, k, memory)
             passed, after = self._filtered(k, rate, memory.carried[1:], view.period)
             u, mine = loop.obey(model.models[k], own, passed[self.outputs_of(k)], mine)
-            filters.append(after)
+            held = (memory.carried[0] + view.period * rate).at[self.outputs_of(k)].set(0.0)
+            stages.append(jnp.concatenate([held[None], after]))
             inputs.append(none.at[model.inputs_of(k)].set(u))
             each.append(mine)
         place = self.place(model, view.x, view.offset, memory)
-        held = memory.carried[:1] + view.period * rate
-        carried = jnp.concatenate([held, model.chosen(view.x, filters)])
+        carried = model.chosen(view.x, stages)
         memory = self.beside(memory._replace(rate=rate, carried=carried), place)
         return model.chosen(view.x, inputs), self._with(model, view.x, each, memory)
 

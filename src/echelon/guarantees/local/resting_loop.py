@@ -24,7 +24,7 @@ from echelon.agents.references.reference import LeaderPath
 from echelon.core.compiled import cached_jit, compiled_for_one_call
 from echelon.core.numerics import Field
 from echelon.core.types import Array, Input, PyTree, Scalar, State
-from echelon.laws.law import Expected, Law, LocalView, Memory, Speaks, Travels, reference_of
+from echelon.laws.law import Expected, Feeds, Law, LocalView, Memory, Speaks, Travels, reference_of
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import Prepared
@@ -84,7 +84,12 @@ class RestingLeader(Law, Travels, Speaks):
     ) -> Expected:
         """Return what it says at its trim, with the deviation."""
         x = _trim_at(model, t, self.travel)
-        return Expected(deviation + self._said(model, x, jnp.zeros_like(x), self.begin(model, x)))
+        memory, silence = self.begin(model, x), jnp.zeros(len(model.input_names))
+        there = deviation + self._said(model, x, jnp.zeros_like(x), memory)
+        if not Speaks.may(self.follower, "signal"):
+            return Expected(there)
+        # No law acts on a signal as on a state: at its trim a leader sends what it began with.
+        return Expected(there, Feeds.of(self.follower).message(model, x, silence, memory))
 
     def _said(self, model: ControlAffine, x: State, offset: State, memory: Memory) -> jax.Array:
         said = self.signal(model, x, offset, memory)
