@@ -95,12 +95,12 @@ class UnlikeAgents(ControlAffine):
 
         return jax.tree.map(choose, *each)
 
-    def part(self, kind: int, x: State) -> State:
+    def part(self, kind: int, x: State) -> jax.Array:
         """Return the states of a group; those of its trim for an agent of another group."""
         mine = jnp.abs(x[-1] - kind) < 0.5
         return jnp.where(mine, x[self.states_of(kind)], jnp.asarray(self._rest(kind), x.dtype))
 
-    def whole(self, kind: int, part: State) -> State:
+    def whole(self, kind: int, part: jax.Array) -> State:
         """Return the state of an agent of a group; what it does not have is at the trim."""
         rest = jnp.asarray(np.asarray(self.trim[0], float), part.dtype)
         return rest.at[self.states_of(kind)].set(part).at[-1].set(kind)
