@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Self, TypeAlias, cast
 
 import equinox as eqx
@@ -138,8 +138,8 @@ class FlatLaw(Law, Speaks, Feeds, KeepsApart, Checks):
         assert self.speeds is not None, "`prepared` finds the speeds"
         return float(self.speeds[output] if isinstance(self.speeds, Sequence) else self.speeds)
 
-    def build_loop(self, model: ControlAffine) -> FlatLoop | UnlikeLoop:
-        """Return the inner loop for a model.
+    def build_loop(self, model: ControlAffine, agents: Iterable[int] = ()) -> FlatLoop | UnlikeLoop:
+        """Return the inner loop for a model; `agents` are those under the law, where unlike.
 
         Raises:
             LawError: the model has no flat coordinates, or bounds of which nothing is proved, or
@@ -162,7 +162,7 @@ class FlatLaw(Law, Speaks, Feeds, KeepsApart, Checks):
         if isinstance(model, UnlikeAgents):
             if self.safety is not None:
                 raise LawError("`safety` is of agents that are alike, and these are not.")
-            loop = UnlikeLoop.of(model, loops, roots)
+            loop = UnlikeLoop.of(model, loops, roots, agents)
         outputs = loop.chains.outputs
         if isinstance(self.speed, Sequence) and len(self.speed) != len(outputs):
             raise LawError(

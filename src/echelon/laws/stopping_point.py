@@ -185,7 +185,8 @@ class StoppingPoint(FlatLaw, Proves):
             # Raises where the graph is no tree.
             graph.parents()
             links = int(graph.depths().max())
-        loop = self.build_loop(model)
+        # A leader that hands over follows like all others.
+        loop = self.build_loop(model, range(graph.agents) if graph.backups else graph.followers)
         reach = GraphDemand.of(graph, self.leaderward, links)
         speeds = self.speeds_within(model, loop, SPEED, _share(links), links)
         # All of it anew, since a law may come from a run of another model or graph.
@@ -295,7 +296,7 @@ class StoppingLeader(FlatLaw, Travels, Proves):
 
     def prepared(self, model: ControlAffine, graph: Graph) -> "StoppingLeader":
         """Find the model's chains, and check that it can be led along the reference."""
-        loop = self.build_loop(model)
+        loop = self.build_loop(model, (*graph.leaders, *graph.backups))
         if self.reference is not None:
             check_reference(self.reference)
             if not isinstance(self.reference, Reference):

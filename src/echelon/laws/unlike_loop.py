@@ -23,7 +23,7 @@ from echelon.laws.flat_loop import FlatLoop, FlatMemory, Observer, beside_turns,
 from echelon.laws.law import LocalView
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
 _INSTANT = 1e-12
 """Of a root times the period; a shorter one is none."""
@@ -39,6 +39,8 @@ class UnlikeLoop(eqx.Module):
         weights, stiffness: of the longest chains, as in `FlatLoop`.
         roots: (r - 1,) of q, 1/s.
         leading: the group of the leader.
+        present: the groups of the agents under the law. At the trim, where a leader may rest under
+            the law of followers of other groups, all groups are at the same place.
         observer: of all.
         angles: which outputs are angles.
     """
@@ -49,14 +51,19 @@ class UnlikeLoop(eqx.Module):
     stiffness: Array
     roots: tuple[float, ...] = eqx.field(static=True)
     leading: int = eqx.field(static=True)
+    present: tuple[int, ...] = eqx.field(static=True)
     observer: Observer = eqx.field(static=True)
     angles: tuple[int, ...] = eqx.field(static=True, default=())
 
     @classmethod
     def of(
-        cls, model: UnlikeAgents, loops: "Sequence[FlatLoop]", roots: tuple[float, ...]
+        cls,
+        model: UnlikeAgents,
+        loops: "Sequence[FlatLoop]",
+        roots: tuple[float, ...],
+        agents: "Iterable[int]",
     ) -> "UnlikeLoop":
-        """Return it of the loops of the groups, of which the longest has all roots (1/s).
+        """Return it for some agents, of the loops of all groups; the longest has all roots (1/s).
 
         Raises:
             LawError: the scale of the thrust is to be estimated.
@@ -74,7 +81,7 @@ class UnlikeLoop(eqx.Module):
         chains = Chains(outputs, tuple(degrees.values()), integrators)
         weights, stiffness = chain_weights(chains.degrees, roots)
         turning = tuple(sorted(map(outputs.index, angles)))
-        rest = roots, model.own_kind, observer, turning
+        rest = roots, model.own_kind, model.kinds_of(agents), observer, turning
         return cls(tuple(loops), chains, weights, stiffness, *rest)
 
     # ---- whose is what ----
@@ -83,9 +90,9 @@ class UnlikeLoop(eqx.Module):
         """Return where the outputs of a group are among all."""
         return np.array([self.chains.outputs.index(x) for x in self.loops[kind].chains.outputs])
 
-    def ahead_of(self, kind: int, ahead: jax.Array | Array) -> jax.Array | Array:
+    def ahead_of(self, kind: int, ahead: jax.Array | Array) -> jax.Array:
         """Return what is ahead, (r, m), in the outputs of a group."""
-        return ahead[: len(self.loops[kind].weights), self.outputs_of(kind)]
+        return jnp.asarray(ahead)[: len(self.loops[kind].weights), self.outputs_of(kind)]
 
     def filters_of(self, kind: int) -> Array:
         """Return which roots (r - 1, m) an output's own chain lacks; none of what it carries."""
@@ -127,7 +134,7 @@ class UnlikeLoop(eqx.Module):
     ) -> FlatMemory:
         """Return the memory with that of the agent's group; of the other groups it is zero."""
         zero, wholes = self.zero_memory(), list[tuple[jax.Array, ...]]()
-        for k, own in enumerate(each):
+        for k, own in zip(self.present, each, strict=True):
             at = self.outputs_of(k)
             wholes.append(
                 (
@@ -138,7 +145,7 @@ class UnlikeLoop(eqx.Module):
                     own.half,
                 )
             )
-        chain, delivered, base, push, half = model.chosen(x, wholes)
+        chain, delivered, base, push, half = model.chosen(x, wholes, self.present)
         return memory._replace(chain=chain, delivered=delivered, base=base, push=push, half=half)
 
     # ---- memory ----
@@ -159,14 +166,15 @@ class UnlikeLoop(eqx.Module):
         """
         assert isinstance(model, UnlikeAgents)
         each, filters = list[FlatMemory](), list[jax.Array]()
-        for k, loop in enumerate(self.loops):
+        for k in self.present:
+            loop = self.loops[k]
             own, part, mine = model.models[k], model.part(k, x), self.ahead_of(k, ahead)
             e = initial_integrators(own, loop.chains, part, mine)
             each.append(loop.initial_memory(own, part, e))
             level = self._level(k, ahead)
             filters.append(level if moves else jnp.zeros_like(level))
         # What it does not have begins at 0, where `output` has it too.
-        carried = jnp.pad(model.chosen(x, filters), ((1, 0), (0, 0)))
+        carried = jnp.pad(model.chosen(x, filters, self.present), ((1, 0), (0, 0)))
         memory = self.zero_memory()._replace(carried=carried)
         memory = self._with(model, x, each, jax.tree.map(lambda y: y.astype(x.dtype), memory))
         return self.beside(memory, self.stop(ahead))
@@ -201,7 +209,8 @@ class UnlikeLoop(eqx.Module):
         names, each, stages = model.state_names, list[jax.Array](), memory.carried[1:]
         known = [offset[names.index(y)] if y in names else 0.0 * x[0] for y in self.chains.outputs]
         carried = memory.carried[0] - jnp.stack(known)
-        for k, loop in enumerate(self.loops):
+        for k in self.present:
+            loop = self.loops[k]
             own, part = model.models[k], model.part(k, x)
             place = loop.stop(loop.flat_values(own, part, self._memory_of(model, k, memory)))
             place = place - loop.shift(own, offset[model.states_of(k)])
@@ -209,7 +218,7 @@ class UnlikeLoop(eqx.Module):
             ahead = jnp.where(self.filters_of(k), stages / roots, 0.0).sum(axis=0)
             at = self.outputs_of(k)
             each.append(carried.at[at].set(place + ahead[at]))
-        return beside_turns(model.chosen(x, each), memory.heading, self.angles)
+        return beside_turns(model.chosen(x, each, self.present), memory.heading, self.angles)
 
     def _filtered(
         self, kind: int, rate: jax.Array, stages: jax.Array, period: Scalar | float
@@ -240,7 +249,8 @@ class UnlikeLoop(eqx.Module):
         assert isinstance(model, UnlikeAgents) and memory.carried is not None
         inputs, each, stages = list[Input](), list[FlatMemory](), list[jax.Array]()
         none = jnp.zeros(len(model.input_names), view.x.dtype)
-        for k, loop in enumerate(self.loops):
+        for k in self.present:
+            loop = self.loops[k]
             offset = view.offset[model.states_of(k)]
             own = eqx.tree_at(lambda v: (v.x, v.offset), view, (model.part(k, view.x), offset))
             mine = self._memory_of(model, k, memory)
@@ -251,9 +261,9 @@ class UnlikeLoop(eqx.Module):
             inputs.append(none.at[model.inputs_of(k)].set(u))
             each.append(mine)
         place = self.place(model, view.x, view.offset, memory)
-        carried = model.chosen(view.x, stages)
+        carried = model.chosen(view.x, stages, self.present)
         memory = self.beside(memory._replace(rate=rate, carried=carried), place)
-        return model.chosen(view.x, inputs), self._with(model, view.x, each, memory)
+        return model.chosen(view.x, inputs, self.present), self._with(model, view.x, each, memory)
 
     def settle(
         self,
@@ -267,7 +277,8 @@ class UnlikeLoop(eqx.Module):
         """Return the memory after the actuators delivered `delivered` of the `desired` input."""
         assert isinstance(model, UnlikeAgents)
         each = list[FlatMemory]()
-        for k, loop in enumerate(self.loops):
+        for k in self.present:
+            loop = self.loops[k]
             own, at = model.models[k], model.inputs_of(k)
             mine = self._memory_of(model, k, memory)
             part = model.part(k, x)

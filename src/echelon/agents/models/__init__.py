@@ -10,6 +10,7 @@ from echelon.agents.models.planar_quadrotor import PlanarQuadrotor
 from echelon.agents.models.quadrotor import PrintedQuadrotor, Quadrotor
 from echelon.agents.models.quadrotor_euler import CrazyflieAttitude, QuadrotorEuler, QuadrotorThrust
 from echelon.agents.models.unicycle import Unicycle, UnicyclePoint
+from echelon.agents.models.unlike import UnlikeAgents
 
 __all__ = [
     "Bicycle",
@@ -30,5 +31,6 @@ __all__ = [
     "SingleIntegrator",
     "Unicycle",
     "UnicyclePoint",
+    "UnlikeAgents",
     "VanDerPol",
 ]

@@ -68,6 +68,10 @@ class UnlikeAgents(ControlAffine):
 
     # ---- whose is what ----
 
+    def kinds_of(self, agents: Iterable[int]) -> tuple[int, ...]:
+        """Return the groups that some agents are of."""
+        return tuple(sorted({self.kinds[agent] for agent in agents}))
+
     @property
     def own_kind(self) -> int:
         """The group of the agent that leads."""
@@ -82,11 +86,14 @@ class UnlikeAgents(ControlAffine):
         ends = np.cumsum([0, *(len(model.input_names) for model in self.models)]).tolist()
         return slice(ends[kind], ends[kind + 1])
 
-    def chosen(self, x: State, each: Sequence[_Entry]) -> _Entry:
-        """Return of values for each group that of the group of an agent at x."""
+    def chosen(
+        self, x: State, each: Sequence[_Entry], kinds: tuple[int, ...] | None = None
+    ) -> _Entry:
+        """Return of values for each group, or for some, that of the group of an agent at x."""
+        known = kinds or tuple(range(len(self.models)))
 
         def choose(*leaves: jax.Array) -> jax.Array:
-            pairs = enumerate(leaves[1:], 1)
+            pairs = zip(known[1:], leaves[1:], strict=True)
             return functools.reduce(
                 lambda before, pair: jnp.where(x[-1] > pair[0] - 0.5, pair[1], before),
                 pairs,
@@ -250,7 +257,8 @@ class UnlikeAgents(ControlAffine):
         limits = [model.input_limits or _none(model) for model in self.models]
         if all(model.input_limits is None for model in self.models):
             return None
-        low, high = (sum((tuple(x[k]) for x in limits), start=()) for k in (1, 2))
+        low = sum((tuple(x.low) for x in limits), start=())
+        high = sum((tuple(x.high) for x in limits), start=())
         return Limits(_blocks([np.asarray(x.matrix, float) for x in limits]), low, high)
 
     def limit(self, u: Input) -> Input:
