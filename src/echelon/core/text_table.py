@@ -28,6 +28,8 @@ _LARGEST = 2**26
 _SAMPLE = 50
 """Rows from which the delimiter is recognized."""
 _COMMENTS = ("#", "%", "//")
+_BEHIND = re.compile(r"\s(?:#|//)")
+"""Where a comment behind numbers begins."""
 _DELIMITERS = {";": "semicolons", "\t": "tabs", "|": "bars", ",": "commas", " ": "blanks"}
 _NUMBER = re.compile(r"[+-]?(?:\d+(?:[.,]\d+)?|\d+\.|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+")

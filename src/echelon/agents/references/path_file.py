@@ -285,20 +285,8 @@ def _east_north_up(
     file: PathLike, places: Float[Array, "K 3"], lines: Sequence[int], heights: bool
 ) -> Float[Array, "K 3"]:
     """Return places (latitude and longitude in rad, altitude in m) in m about the first one."""
-    limits = np.array([np.pi / 2.0, 2.0 * np.pi])
-    for k, axis in np.argwhere(np.abs(places[:, :2]) > limits)[:1]:
-        name, most = (("lat", 90), ("lon", 360))[axis]
-        raise ReferenceError(
-            f"`{name}` of the path at `{file}:{lines[k]}` is {np.degrees(places[k, axis]):.10g} "
-            f"deg, and must be from -{most} to {most} deg."
-        )
+    _check_on_earth(file, places, lines)
     lat, lon, alt = places.T
-    unknown = np.flatnonzero((lat == 0.0) & (lon == 0.0))
-    if len(unknown) and np.abs(places[:, :2]).max() > 0.1:
-        raise ReferenceError(
-            f"`lat` and `lon` of the path at `{file}:{lines[unknown[0]]}` are 0, as receivers "
-            "without a fix write; delete such lines."
-        )
     normal = _RADIUS / np.sqrt(1.0 - _SQUARED * np.sin(lat) ** 2)
     flat = (normal + alt) * np.cos(lat)
     fixed = np.stack(
@@ -309,6 +297,22 @@ def _east_north_up(
     local = (axes @ (fixed - fixed[:, :1])).T
     local[:, 2] *= heights
     return local
+
+
+def _check_on_earth(file: PathLike, places: Float[Array, "K 3"], lines: Sequence[int]) -> None:
+    limits = np.array([np.pi / 2.0, 2.0 * np.pi])
+    for k, axis in np.argwhere(np.abs(places[:, :2]) > limits)[:1]:
+        name, most = (("lat", 90), ("lon", 360))[axis]
+        raise ReferenceError(
+            f"`{name}` of the path at `{file}:{lines[k]}` is {np.degrees(places[k, axis]):.10g} "
+            f"deg, and must be from -{most} to {most} deg."
+        )
+    unknown = np.flatnonzero((places[:, :2] == 0.0).all(axis=1))
+    if len(unknown) and np.abs(places[:, :2]).max() > 0.1:
+        raise ReferenceError(
+            f"`lat` and `lon` of the path at `{file}:{lines[unknown[0]]}` are 0, as receivers "
+            "without a fix write; delete such lines."
+        )
 
 
 def _read_gpx(file: PathLike) -> Columns:
