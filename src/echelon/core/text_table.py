@@ -250,9 +250,7 @@ def read_table(file: PathLike, what: str, fault: type[EchelonError]) -> TextTabl
     stated = re.fullmatch(r'"?sep=([;,|\t])"?', lines[0][1], re.IGNORECASE) if lines else None
     lines = lines[1:] if stated else lines
     remarks = [(k, line) for k, line in lines if line.startswith(_COMMENTS)]
-    body = [
-        (k, re.split(r"\s(?:#|//)", line)[0]) for k, line in lines if not line.startswith(_COMMENTS)
-    ]
+    body = [(k, _BEHIND.split(x)[0]) for k, x in lines if not x.startswith(_COMMENTS)]
     if not body:
         raise fault(f"the {what} `{file}` has no line of numbers.")
     delimiter = stated[1] if stated else _delimiter([line for _, line in body[:_SAMPLE]])

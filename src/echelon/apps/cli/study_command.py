@@ -55,11 +55,11 @@ def check(
     if as_json:
         print(json.dumps(checked.as_mapping(), indent=2))
     else:
-        from echelon.output.reports.check_report import check_report, check_sentences, grouped
+        from echelon.output.reports.check_report import check_report, print_statements
         from echelon.output.reports.region_report import region_report
 
         if every or as_latex:
-            tables.print_statements(grouped(checked.lines), check_sentences(checked), as_latex)
+            print_statements(tables.console(as_latex=as_latex), checked)
             if checked.region is not None:
                 print("\n" + region_report(checked.region))
         else:
@@ -157,11 +157,13 @@ def design(
 
                 sentence += f"\n\n{region_report(seen)}"
                 summary["region"] = seen.as_mapping()
-    summary["methods"] = [tables.design_row(row) for row in report.designs]
+    from echelon.output.reports.design_report import design_row, print_designs
+
+    summary["methods"] = [design_row(row) for row in report.designs]
     if as_json:
         print(json.dumps(summary, indent=2))
     else:
-        tables.print_designs(summary["methods"], sentence, as_latex)
+        print_designs(tables.console(as_latex=as_latex), summary["methods"], sentence)
     raise typer.Exit(1 if best is None else 0)
 
 

@@ -9,6 +9,7 @@ import equinox as eqx
 import numpy as np
 
 from echelon.core.errors import EchelonError, LawError, Outcome
+from echelon.core.files import notebook_page
 from echelon.core.limits import excess_runs
 from echelon.core.types import Array
 from echelon.experiments.results.metrics import RunNumbers, arrived, metrics
@@ -109,6 +110,9 @@ class SeedComparison(NamedTuple):
     rows: Sequence[MethodSeeds]
     horizon: float
     conditions: Sequence[str]
+
+    def _repr_html_(self) -> str:
+        return notebook_page("report", self)
 
     @property
     def length_unit(self) -> str:
