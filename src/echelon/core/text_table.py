@@ -294,8 +294,12 @@ def read_text(file: PathLike, what: str, fault: type[EchelonError]) -> str:
 
 def read_xml(file: PathLike, what: str, fault: type[EchelonError], kind: str) -> Element:
     """Return the root of an XML file, such as of a `kind` GPX; else raise `fault`."""
+    text = read_text(file, what, fault)
+    # Its entities may grow without bound, and none of these kinds needs one.
+    if "<!DOCTYPE" in text:
+        raise fault(f"the {what} `{file}` has a `<!DOCTYPE`, which is not read; delete it.")
     try:
-        return fromstring(read_text(file, what, fault))
+        return fromstring(text)
     except (ParseError, ValueError) as error:
         raise fault(f"the {what} `{file}` is not {kind}: {error}.") from None
 
