@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from echelon.apps.cli.terminal import STATUS
+from echelon.core.errors import OutputError
 from echelon.core.files import write_atomic
 from echelon.output.archive.folder import write_errors
 
@@ -98,3 +99,17 @@ def write_file(file: Path, content: bytes | str, remark: str = "{}") -> None:
 def print_file(file: Path, remark: str) -> None:
     """Print the size of a file, with a remark that goes before it or after it."""
     print(f"- Written to {file}: {remark.format(f'{file.stat().st_size / 1e6:.2f} MB')}.")
+
+
+def check_inputs(command: str, scenario: str | None, resume: Path | None, *others: object) -> None:
+    """Check that a command is given either a scenario or a folder to continue.
+
+    Raises:
+        OutputError: it is given neither, or other inputs beside the folder.
+    """
+    if resume is None and scenario is None:
+        raise OutputError(
+            f"no scenario was given; give one, or `--resume` with the folder of a {command}."
+        )
+    if resume is not None and (scenario is not None or any(others)):
+        raise OutputError("`--resume` takes its inputs from the folder; give no others.")
