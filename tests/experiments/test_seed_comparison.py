@@ -3,6 +3,7 @@
 import csv
 import itertools
 import json
+import signal
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,15 +11,20 @@ import pytest
 from scipy.stats import binom
 
 import echelon as ech
+from echelon.apps.cli.terminal import STOP
+from echelon.experiments.studies import seed_comparison
 from echelon.experiments.studies.seed_comparison import (
     LEVELS,
     NUMBERS,
     MethodSeeds,
     SeedComparison,
+    SeedStore,
     compare_seeds,
     median_interval,
     quantiles,
 )
+from echelon.output.archive.chunks import Chunks
+from echelon.output.archive.study_folder import SeedBatches
 from echelon.output.plots.study_figures import seed_figures
 from echelon.output.reports.comparison_report import comparison_mapping, comparison_report
 
@@ -240,3 +246,74 @@ def test_bad_input_is_one_sentence_and_leaves_no_folder(echelon, here, option, v
     code, out, err = echelon("compare", "noisy.yaml", f"{option}={value}", "--out", "p")
     assert code == 2 and text in err and not out and len(err.strip().splitlines()) == 1
     assert not (here / "p").exists()
+
+
+COMPARED = ("--seeds", "0..8", "--horizon", "0.2", "--no-figures", "--method", "riccati")
+COMPARED += ("--method", "riccati-relay", "--method", "own", "--method")
+
+
+STILL = """import echelon as ech
+
+class Still(ech.Law):
+    def update(self, model, view, memory):
+        return 0.0 * model.physical(view.disagreement[:2]), memory
+"""
+
+
+@pytest.fixture
+def own_law(here):
+    """A scenario of which three runs fit in a batch, and a law in a file beside it."""
+    (here / "noisy.yaml").write_text(json.dumps(NOISY), "utf-8")
+    (here / "still.py").write_text(STILL, "utf-8")
+    return "still.py:Still"
+
+
+def files_of(folder):
+    names = ("comparison.json", "comparison.txt", "runs/seeds.csv")
+    return {name: (folder / name).read_bytes() for name in names}
+
+
+@pytest.mark.parametrize("batches", [0, 1, 4, 7])
+def test_an_interrupted_comparison_continues_with_the_same_output(
+    echelon, here, own_law, monkeypatch, batches
+):
+    monkeypatch.setattr(seed_comparison, "batch_size", lambda *_: 4)
+    call = ("compare", "noisy.yaml", *COMPARED, own_law, "--out")
+    assert echelon(*call, "whole")[0] == 0
+    fly, flown = seed_comparison.Batch.fly, []
+
+    def stopped(self, runs, report):
+        flown.append(len(runs))
+        if len(flown) == batches + 1:
+            STOP.number = signal.SIGINT
+        return fly(self, runs, report)
+
+    monkeypatch.setattr(seed_comparison.Batch, "fly", stopped)
+    code, said, _ = echelon(*call, "part")
+    assert code == 130 and files_of(here / "part") != files_of(here / "whole")
+    assert ("`echelon compare --resume part` continues" in said) == (batches > 0)
+    flown[:] = [0] * 100
+    assert echelon("compare", "--resume", "part", "--no-figures")[0] == 0
+    # Batches of 4, 4 and 1 runs for each of the three methods that differ, none of them again.
+    assert len(flown) - 100 == 9 - batches
+    assert files_of(here / "part") == files_of(here / "whole")
+    code, said, _ = echelon("compare", "--resume", "part")
+    assert code == 0 and not said.count("quantiles")
+
+
+def test_a_comparison_with_other_inputs_does_not_continue(echelon, here, own_law, monkeypatch):
+    monkeypatch.setattr(SeedBatches, "store", property(lambda self: SeedStore()))
+    monkeypatch.setattr(Chunks, "remove", lambda self: None)
+    assert echelon("compare", "noisy.yaml", *COMPARED, own_law, "--out", "o")[0] == 0
+    assert echelon("compare", "--resume", "o", "--seeds", "1..2")[2] == (
+        "echelon: `--resume` takes its inputs from the folder; give no others.\n"
+    )
+    assert "no scenario was given; give one, or `--resume` with" in echelon("compare")[2]
+    (here / "still.py").write_text("", "utf-8")
+    code, _, fault = echelon("compare", "--resume", "o")
+    assert code == 2 and "`still.py` is not the file with which the comparison in `o/runs`" in fault
+    (here / "o" / "runs" / "scenario.yaml").write_text("{}", "utf-8")
+    code, _, fault = echelon("compare", "--resume", "o")
+    assert code == 2 and "the scenario in `o/runs` was changed" in fault
+    code, _, fault = echelon("compare", "--resume", "none")
+    assert code == 2 and "holds no unfinished run" in fault

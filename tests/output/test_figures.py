@@ -11,6 +11,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from recordings import GUARANTEE, as_file, flown, swinging, tracked, with_errors
 
 from echelon.agents.network.switching import Schedule
@@ -146,6 +147,52 @@ def test_settings_that_the_user_has_changed_apply_to_lines_and_legends(run):
         assert {line.get_linewidth() for line in figure.axes[0].lines} == {width}
         assert figure.legends[0].get_texts()[0].get_fontsize() == pytest.approx(size)
         assert figure.axes[0].xaxis.label.get_fontname() == "STIXGeneral"
+
+
+OWN = {
+    "lines.linewidth": 2.2,
+    "lines.markersize": 10.0,
+    "legend.fontsize": 14.0,
+    "legend.labelcolor": "red",
+    "font.family": "DejaVu Sans",
+    "font.size": 12.0,
+    "axes.labelsize": "large",
+    "axes.spines.right": False,
+    "axes.facecolor": "0.8",
+    "axes.prop_cycle": matplotlib.cycler(color=["#123456", "#abcdef"], linestyle=["-", "--"]),
+    "axes.grid.axis": "y",
+    "grid.color": "green",
+    "xtick.labelsize": 6.0,
+    "ytick.labelsize": 7.0,
+}
+
+
+def test_figures_follow_the_settings_of_the_user(run):
+    names = ["formation", "trajectories", "network", "distances"]
+    with matplotlib.rc_context(OWN):
+        own = figures(run, names)
+    plain = figures(run, names)
+    ax, legend = own["formation"].axes[0], own["formation"].legends[0]
+    followers = [line for line in ax.lines if line.get_label().startswith("follower")]
+    looks = [(line.get_color(), line.get_linestyle()) for line in followers]
+    assert looks == [("#123456", "-"), ("#abcdef", "--"), ("#123456", "-")]
+    assert {text.get_fontsize() for text in legend.get_texts()} == {14.0}
+    assert {to_rgb(text.get_color()) for text in legend.get_texts()} == {(1.0, 0.0, 0.0)}
+    assert ax.yaxis.label.get_fontname() == "DejaVu Sans"
+    assert ax.yaxis.label.get_fontsize() == pytest.approx(1.2 * 12.0)
+    assert to_rgb(ax.get_facecolor()) == (0.8, 0.8, 0.8)
+    assert ax.get_yticklabels()[0].get_fontsize() == 7.0
+    assert own["formation"].axes[-1].get_xticklabels()[0].get_fontsize() == 6.0
+    assert ax.get_ygridlines()[0].get_color() == "green"
+    assert not ax.get_xgridlines()[0].get_visible() and ax.get_ygridlines()[0].get_visible()
+    # What echelon draws broader than a line, or larger than a marker, keeps its proportion.
+    for name in names:
+        for one, other in zip(own[name].axes, plain[name].axes, strict=True):
+            for of in (Line2D.get_linewidth, Line2D.get_markersize):
+                sizes = [sorted({of(line) for line in axes.lines}) for axes in (one, other)]
+                assert sizes[0] == pytest.approx(2.0 * np.array(sizes[1]))
+    wide = [figure["network"].axes[0].collections[0].get_linewidths() for figure in (own, plain)]
+    assert wide[0] == pytest.approx(2.0 * np.array(wide[1]))
 
 
 def test_the_network_has_every_edge_and_an_arrow_from_who_leads(run):

@@ -86,6 +86,7 @@ def _commit() -> str | None:
 _PAGES: Final = {
     "result": "echelon.output.archive.notebook:result_page",
     "replay": "echelon.output.archive.notebook:result_replay",
+    "report": "echelon.output.reports.html_report:html_report",
 }
 
 

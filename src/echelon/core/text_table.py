@@ -9,7 +9,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree.ElementTree import Element, ParseError, fromstring
@@ -28,17 +28,22 @@ _LARGEST = 2**26
 _SAMPLE = 50
 """Rows from which the delimiter is recognized."""
 _COMMENTS = ("#", "%", "//")
+_BEHIND = re.compile(r"\s(?:#|//)")
+"""Where a comment behind numbers begins."""
 _DELIMITERS = {";": "semicolons", "\t": "tabs", "|": "bars", ",": "commas", " ": "blanks"}
 _NUMBER = re.compile(r"[+-]?(?:\d+(?:[.,]\d+)?|\d+\.|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
-_THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:,\d{3})+")
+_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+")
 _UNITS = {
     **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), ("s", 1.0)),
     **dict.fromkeys(("ms", "msec", "millisecond", "milliseconds"), ("s", 1e-3)),
     **dict.fromkeys(("us", "\u00b5s", "\u03bcs", "usec", "microseconds"), ("s", 1e-6)),
     **dict.fromkeys(("ns", "nsec", "nanoseconds"), ("s", 1e-9)),
     **dict.fromkeys(("min", "minutes"), ("s", 60.0)),
+    **dict.fromkeys(("hour", "hours"), ("s", 3600.0)),
     **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), ("m", 1.0)),
-    **{"mm": ("m", 1e-3), "cm": ("m", 1e-2), "km": ("m", 1e3), "ft": ("m", 0.3048)},
+    **{"mm": ("m", 1e-3), "cm": ("m", 1e-2), "km": ("m", 1e3)},
+    **dict.fromkeys(("ft", "foot", "feet"), ("m", 0.3048)),
+    **dict.fromkeys(("inch", "inches"), ("m", 0.0254)),
     **dict.fromkeys(("rad", "radian", "radians"), ("rad", 1.0)),
     **dict.fromkeys(("deg", "degree", "degrees", "\u00b0"), ("rad", math.pi / 180.0)),
     **{"": ("", 1.0), "1": ("", 1.0), "-": ("", 1.0)},
@@ -177,7 +182,11 @@ class TextTable(NamedTuple):
 
         NumPy and ROS write the header as a comment, and instruments write lines before it.
         """
-        tables = [self, *(self._replace(head=row) for row in reversed(self.remarks))]
+        rows = self.rows
+        # Numbers beside text, as names of frames, are no header.
+        if self.head is not None and any(number_in(cell) is not None for cell in self.head.cells):
+            rows = [self.head, *rows]
+        tables = [self, *(self._replace(head=row, rows=rows) for row in reversed(self.remarks))]
         first = [] if self.head is None else enumerate(self.rows[:_SAMPLE], 1)
         tables += [self._replace(head=row, rows=self.rows[k:]) for k, row in first]
         needed = [column for column in wanted if not column.optional]
@@ -223,7 +232,8 @@ class TextTable(NamedTuple):
 def read_table(file: PathLike, what: str, fault: type[EchelonError]) -> TextTable:
     """Return the cells of a text file.
 
-    Lines that begin with `#`, `%` or `//` are comments, and so is what follows a blank and `#`.
+    Lines that begin with `#`, `%` or `//` are comments, and so is what follows a blank and `#`
+    or `//`.
 
     Args:
         file: path of the file, in UTF-8, UTF-16 with a byte order mark, or cp1252.
@@ -240,7 +250,7 @@ def read_table(file: PathLike, what: str, fault: type[EchelonError]) -> TextTabl
     stated = re.fullmatch(r'"?sep=([;,|\t])"?', lines[0][1], re.IGNORECASE) if lines else None
     lines = lines[1:] if stated else lines
     remarks = [(k, line) for k, line in lines if line.startswith(_COMMENTS)]
-    body = [(k, re.split(r"\s#", line)[0]) for k, line in lines if not line.startswith(_COMMENTS)]
+    body = [(k, _BEHIND.split(x)[0]) for k, x in lines if not x.startswith(_COMMENTS)]
     if not body:
         raise fault(f"the {what} `{file}` has no line of numbers.")
     delimiter = stated[1] if stated else _delimiter([line for _, line in body[:_SAMPLE]])
@@ -284,8 +294,12 @@ def read_text(file: PathLike, what: str, fault: type[EchelonError]) -> str:
 
 def read_xml(file: PathLike, what: str, fault: type[EchelonError], kind: str) -> Element:
     """Return the root of an XML file, such as of a `kind` GPX; else raise `fault`."""
+    text = read_text(file, what, fault)
+    # Its entities may grow without bound, and none of these kinds needs one.
+    if "<!DOCTYPE" in text:
+        raise fault(f"the {what} `{file}` has a `<!DOCTYPE`, which is not read; delete it.")
     try:
-        return fromstring(read_text(file, what, fault))
+        return fromstring(text)
     except (ParseError, ValueError) as error:
         raise fault(f"the {what} `{file}` is not {kind}: {error}.") from None
 
@@ -409,7 +423,9 @@ def number_in(cell: str) -> float | None:
 
 def seconds_of(date: str) -> float:
     """Return the Unix time of a date in ISO 8601, s; `ValueError` where it is none."""
-    return datetime.fromisoformat(date).timestamp()
+    time = datetime.fromisoformat(date)
+    # Without a zone it is UTC: clocks of a zone jump twice a year.
+    return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
 
 
 def _number(table: TextTable, column: Column, row: _Row, k: int) -> float:
@@ -437,4 +453,18 @@ def _check_decimals(table: TextTable, places: list[int]) -> None:
         raise table.fault(
             f"{table.place(max(here, there))} has `{one}` in line {here} and `{other}` in line "
             f"{there}: decimals are points or commas, not both."
+        )
+    if "," in first:
+        _check_thousands(table, places, *first[","])
+
+
+def _check_thousands(table: TextTable, places: list[int], cell: str, line: int) -> None:
+    """Refuse commas that all stand before three digits, beside whole numbers."""
+    cells = [row.cells[k] for row, k in itertools.product(table.rows, places)]
+    marked = [cell for cell in cells if "," in cell]
+    # Who writes decimals with three digits writes them in all cells, and few are above 1 in all.
+    if len(marked) < len(cells) and all(map(_THOUSANDS.fullmatch, marked)):
+        raise table.fault(
+            f"{table.place(line)} has `{cell}`, which may be {cell.replace(',', '')} or "
+            f"{cell.replace(',', '.', 1)}; write numbers without separators of thousands."
         )

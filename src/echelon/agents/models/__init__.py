@@ -2,6 +2,7 @@
 
 from echelon.agents.models.bicycle import Bicycle
 from echelon.agents.models.boat import Boat
+from echelon.agents.models.body_file import MassProperties, read_mass_properties
 from echelon.agents.models.fixed_wing import FixedWing
 from echelon.agents.models.linear_agent import DoubleIntegrator, Linear, SingleIntegrator
 from echelon.agents.models.model import ControlAffine, Heading, Limits
@@ -22,6 +23,7 @@ __all__ = [
     "Heading",
     "Limits",
     "Linear",
+    "MassProperties",
     "Pendulum",
     "PlanarQuadrotor",
     "PrintedQuadrotor",
@@ -33,4 +35,5 @@ __all__ = [
     "UnicyclePoint",
     "UnlikeAgents",
     "VanDerPol",
+    "read_mass_properties",
 ]

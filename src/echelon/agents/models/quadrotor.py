@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from echelon.agents.models.body_file import read_principal
 from echelon.agents.models.model import (
     Airframe,
     ControlAffine,
@@ -34,7 +35,7 @@ from echelon.agents.models.rigid_body import (
     thrust_axis,
 )
 from echelon.core.errors import ModelError, check_name
-from echelon.core.types import Input, InputMap, Output, State
+from echelon.core.types import Input, InputMap, Output, PathLike, State
 
 _IDENTIFIED = (16.571710e-6, 16.655602e-6, 29.261652e-6)
 """Inertia of a Crazyflie of 28 g, kg m^2 (Foerster 2015), the only one that is published."""
@@ -125,6 +126,34 @@ class Quadrotor(RigidVehicle):
         """
         check_name("the parameters of `Quadrotor` are", name, PARAMETERS, ModelError)
         return cls(**{**PARAMETERS[name], **changes})
+
+    @classmethod
+    def read(
+        cls,
+        file: PathLike,
+        arm: float = arm,
+        motor_thrust: float = motor_thrust,
+        torque_per_thrust: float = torque_per_thrust,
+        gravity: float = gravity,
+    ) -> "Quadrotor":
+        """Return the quadrotor with the mass and the inertia of a URDF or MJCF file.
+
+        Its axes are those of the root link; the motors are taken as symmetric about its centre of
+        mass. Neither format states motors, so other numbers are arguments, with the defaults of
+        the class.
+
+        Raises:
+            ModelError: the file cannot be read, or its axes are not principal within 1 %.
+        """
+        mass, inertia = read_principal(file, cls.__name__)
+        return cls(
+            mass=mass,
+            inertia=inertia,
+            gravity=gravity,
+            arm=arm,
+            motor_thrust=motor_thrust,
+            torque_per_thrust=torque_per_thrust,
+        )
 
     @classmethod
     def crazyflie(cls) -> "Quadrotor":

@@ -10,6 +10,7 @@ import scipy.sparse.csgraph as csgraph
 import scipy.sparse.linalg as spla
 
 from echelon.core.errors import GraphError
+from echelon.core.files import notebook_page
 from echelon.core.types import Array
 
 
@@ -33,6 +34,9 @@ class Spectrum(NamedTuple):
     proved: float
     sums: Array | None = None
     weakest: float | None = None
+
+    def _repr_html_(self) -> str:
+        return notebook_page("report", self)
 
     @property
     def low(self) -> float:

@@ -1,5 +1,6 @@
 """Paths in files: tables of timed points or states, in metres or in latitude and longitude, GPX."""
 
+import re
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple, TypeVar
 
@@ -7,18 +8,38 @@ import numpy as np
 from jaxtyping import Float
 
 from echelon.core.errors import ReferenceError
-from echelon.core.text_table import Column, Columns, read_table, read_xml, seconds_of
+from echelon.core.text_table import Column, Columns, TextTable, read_table, read_xml, seconds_of
 from echelon.core.types import Array, PathLike
 
 _TIME = Column(
-    "t", "s", ("time", "timestamp", "elapsed", "time_stamp", "stamp", "sec", "secs", "seconds")
+    "t",
+    "s",
+    (
+        *("time", "timestamp", "elapsed", "time_stamp", "stamp_sec", "stamp_secs", "stamp"),
+        *("header_stamp_sec", "header_stamp_secs", "header_stamp", "field_header_stamp"),
+        *("sec", "secs", "seconds"),
+    ),
 )
+_REST = Column(
+    "nanosec",
+    "s",
+    tuple(
+        f"{before}{name}"
+        for before in ("", "stamp_", "header_stamp_")
+        for name in ("nanosec", "nanosecs", "nanoseconds", "nsec", "nsecs")
+    ),
+    "ns",
+    optional=True,
+)
+"""What messages of ROS have beside whole seconds."""
 _OTHERS = (
     *(
         "pos{}",
         "pos_{}",
         "position_{}",
         "pose_position_{}",
+        "pose_pose_position_{}",
+        "field_pose_position_{}",
         "field_pose_pose_position_{}",
         "p_{}",
         "p{}",
@@ -29,7 +50,14 @@ _PLACE = [
     Column(axis, "m", tuple(other.format(axis) for other in _OTHERS), optional=axis == "z")
     for axis in "xyz"
 ]
-_TURNED = Column("qw", "", ("q_w", "orientation_w", "pose_orientation_w", "q_rs_w", "heading"))
+_TURNED = Column(
+    "qw",
+    "",
+    (
+        *("q_w", "orientation_w", "pose_orientation_w", "pose_pose_orientation_w"),
+        *("field_pose_orientation_w", "field_pose_pose_orientation_w", "q_rs_w", "heading"),
+    ),
+)
 """What states an orientation that is not read."""
 _YAW = Column("yaw", "rad", ("yaw_angle", "psi", "theta"), optional=True)
 _EARTH = [
@@ -41,6 +69,13 @@ _EPOCH, _LASTS = (9e8, 4.1e9), 1e6
 """s; Unix time stamps of 1998 to 2099, and what a path with such lasts at most."""
 _RECORDED, _GAP = 20, 5.0
 """From so many points on a path is a recording, with a gap where a step is so much longer."""
+_SLOW = 5.0
+"""s; points of a recording that are so far apart, at whole numbers, are probably in ms."""
+_FOREIGN = {
+    "xy_valid": "a log of PX4, whose axes point north, east and down and whose times are in us",
+    "Format Version": "an export of Motive, whose y axis may point up",
+}
+"""Files whose axes are others, by a cell of their first line."""
 
 
 class PathRows(NamedTuple):
@@ -102,13 +137,43 @@ def _read_places(
     """Return time, place and yaw, whether places are on the Earth, and an unread orientation."""
     if str(file).lower().endswith(".gpx"):
         return _read_gpx(file), True, ""
-    table = read_table(file, "path", ReferenceError).named(columns).headed([_TIME])
+    table = _table(file, columns).headed([_TIME])
     k = table.find(_TURNED)
     turned = "" if table.head is None or k is None else table.head.cells[k]
     on_earth = not table.has(_PLACE[0]) and table.has(_EARTH[0]) and table.has(_EARTH[1])
     yaw = _YAW._replace(assumed="deg") if degrees else _YAW
     wanted = [_TIME, *(_EARTH if on_earth else _PLACE), yaw]
-    return table.columns(wanted, least=2), on_earth, turned
+    k, cells = table.find(_TIME), () if table.head is None else table.head.cells
+    # A Crazyflie's client writes whole ms.
+    whole = k is not None and bool(table.rows) and table.rows[0].cells[k].isdigit()
+    if whole and any("stateestimate" in cell.lower() for cell in cells):
+        wanted[0] = _TIME._replace(assumed="ms")
+    return _numbers(table, wanted), on_earth, turned
+
+
+def _table(file: PathLike, columns: Sequence[str]) -> TextTable:
+    """Return the table of a file whose axes are known."""
+    table = read_table(file, "path", ReferenceError)
+    for cell in table.head.cells if table.head else ():
+        if cell in _FOREIGN:
+            raise ReferenceError(
+                f"the path `{file}` has `{cell}`: it is {_FOREIGN[cell]}; write a table of `t`, "
+                "`x`, `y`, `z` in s and m, with z up."
+            )
+    return table.named(columns)
+
+
+def _numbers(table: TextTable, wanted: Sequence[Column]) -> Columns:
+    """Return the columns, of which the first is the time, in whole seconds and ns or in one."""
+    table = table.headed(wanted)
+    k = table.find(wanted[0])
+    cells = () if table.head is None else table.head.cells
+    if k is None or not re.search(r"sec(ond)?s?$", cells[k], re.IGNORECASE) or not table.has(_REST):
+        return table.columns(wanted, least=2)
+    read = table.columns([*wanted, _REST], least=2)
+    values = read.values[:, :-1]
+    values[:, 0] += read.values[:, -1]
+    return read._replace(values=values)
 
 
 def read_timed(
@@ -122,9 +187,9 @@ def read_timed(
     Raises:
         ReferenceError: the file cannot be read, lacks a column, or a line is wrong.
     """
-    table = read_table(file, "path", ReferenceError).named(columns)
+    table = _table(file, columns)
     time = _TIME._replace(others=()) if any(c.name in _TIME.others for c in wanted) else _TIME
-    read = table.columns([time, *wanted], least=2)
+    read = _numbers(table, [time, *wanted])
     times, notes = _clock(file, read, begin)
     return PathRows(times, read.values[:, 1:], tuple(notes))
 
@@ -155,7 +220,17 @@ def _clock(file: PathLike, read: Columns, begin: float | None) -> tuple[Array, l
         )
     if stamps is not None or begin is not None:
         times = times - times[0] + (begin or 0.0)
-    return times, [*notes, *_gaps(file, times, read.lines)]
+    unitless = stamps is None and "t" in read.unitless
+    return times, [*notes, *_gaps(file, times, read.lines), *_coarse(file, times, unitless)]
+
+
+def _coarse(file: PathLike, times: Float[Array, " K"], unitless: bool) -> Iterator[str]:
+    usual = np.median(np.diff(times))
+    if unitless and len(times) >= _RECORDED and usual >= _SLOW and not (times % 1.0).any():
+        yield (
+            f"points of the path `{file}` are mostly {usual:.3g} s apart; if its times have "
+            "another unit, state it in the header, as in `t [ms]`."
+        )
 
 
 def _gaps(file: PathLike, times: Float[Array, " K"], lines: Sequence[int]) -> Iterator[str]:
@@ -210,13 +285,7 @@ def _east_north_up(
     file: PathLike, places: Float[Array, "K 3"], lines: Sequence[int], heights: bool
 ) -> Float[Array, "K 3"]:
     """Return places (latitude and longitude in rad, altitude in m) in m about the first one."""
-    limits = np.array([np.pi / 2.0, 2.0 * np.pi])
-    for k, axis in np.argwhere(np.abs(places[:, :2]) > limits)[:1]:
-        name, most = (("lat", 90), ("lon", 360))[axis]
-        raise ReferenceError(
-            f"`{name}` of the path at `{file}:{lines[k]}` is {np.degrees(places[k, axis]):.10g} "
-            f"deg, and must be from -{most} to {most} deg."
-        )
+    _check_on_earth(file, places, lines)
     lat, lon, alt = places.T
     normal = _RADIUS / np.sqrt(1.0 - _SQUARED * np.sin(lat) ** 2)
     flat = (normal + alt) * np.cos(lat)
@@ -228,6 +297,22 @@ def _east_north_up(
     local = (axes @ (fixed - fixed[:, :1])).T
     local[:, 2] *= heights
     return local
+
+
+def _check_on_earth(file: PathLike, places: Float[Array, "K 3"], lines: Sequence[int]) -> None:
+    limits = np.array([np.pi / 2.0, 2.0 * np.pi])
+    for k, axis in np.argwhere(np.abs(places[:, :2]) > limits)[:1]:
+        name, most = (("lat", 90), ("lon", 360))[axis]
+        raise ReferenceError(
+            f"`{name}` of the path at `{file}:{lines[k]}` is {np.degrees(places[k, axis]):.10g} "
+            f"deg, and must be from -{most} to {most} deg."
+        )
+    unknown = np.flatnonzero((places[:, :2] == 0.0).all(axis=1))
+    if len(unknown) and np.abs(places[:, :2]).max() > 0.1:
+        raise ReferenceError(
+            f"`lat` and `lon` of the path at `{file}:{lines[unknown[0]]}` are 0, as receivers "
+            "without a fix write; delete such lines."
+        )
 
 
 def _read_gpx(file: PathLike) -> Columns:

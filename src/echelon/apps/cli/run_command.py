@@ -72,20 +72,6 @@ class Job:
             raise
 
 
-def check_inputs(command: str, scenario: str | None, resume: Path | None, *others: object) -> None:
-    """Check that a command is given either a scenario or a folder to continue.
-
-    Raises:
-        OutputError: it is given neither, or other inputs beside the folder.
-    """
-    if resume is None and scenario is None:
-        raise OutputError(
-            f"no scenario was given; give one, or `--resume` with the folder of a {command}."
-        )
-    if resume is not None and (scenario is not None or any(others)):
-        raise OutputError("`--resume` takes its inputs from the folder; give no others.")
-
-
 # ---- `echelon run` -------------------------------------------------------------------------------
 
 
@@ -113,7 +99,7 @@ def run(
         from echelon.output.viewer.page import check_page
 
         check_page()
-    check_inputs("run", scenario, resume, set_, out, force)
+    tables.check_inputs("run", scenario, resume, set_, out, force)
     from echelon.output.archive.folder import writing
 
     if resume is None:
@@ -356,7 +342,7 @@ def sweep(
     as_json: options.JsonOption = False,
 ) -> None:
     """Run a scenario for all combinations of values; write the numbers of all runs as a dataset."""
-    check_inputs("sweep", scenario, resume, over, set_, out, force, keep_states)
+    tables.check_inputs("sweep", scenario, resume, over, set_, out, force, keep_states)
     if cluster is not None:
         from echelon.experiments.sweeps.cluster import check_scheduler
 

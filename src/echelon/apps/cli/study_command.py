@@ -3,7 +3,7 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import typer
 
@@ -55,11 +55,11 @@ def check(
     if as_json:
         print(json.dumps(checked.as_mapping(), indent=2))
     else:
-        from echelon.output.reports.check_report import check_report, check_sentences, grouped
+        from echelon.output.reports.check_report import check_report, print_statements
         from echelon.output.reports.region_report import region_report
 
         if every or as_latex:
-            tables.print_statements(grouped(checked.lines), check_sentences(checked), as_latex)
+            print_statements(tables.console(as_latex=as_latex), checked)
             if checked.region is not None:
                 print("\n" + region_report(checked.region))
         else:
@@ -157,11 +157,13 @@ def design(
 
                 sentence += f"\n\n{region_report(seen)}"
                 summary["region"] = seen.as_mapping()
-    summary["methods"] = [tables.design_row(row) for row in report.designs]
+    from echelon.output.reports.design_report import design_row, print_designs
+
+    summary["methods"] = [design_row(row) for row in report.designs]
     if as_json:
         print(json.dumps(summary, indent=2))
     else:
-        tables.print_designs(summary["methods"], sentence, as_latex)
+        print_designs(tables.console(as_latex=as_latex), summary["methods"], sentence)
     raise typer.Exit(1 if best is None else 0)
 
 
@@ -181,9 +183,9 @@ def _draw(
 
 def compare(
     scenarios: Annotated[
-        list[str],
+        list[str] | None,
         typer.Argument(help="Names of bundled scenarios, or YAML files.", metavar="SCENARIO..."),
-    ],
+    ] = None,
     horizon: Annotated[float, typer.Option(help="Duration of every run, s.")] = 10.0,
     method: Annotated[
         list[str] | None,
@@ -197,6 +199,7 @@ def compare(
     ] = None,
     set_: options.SetOption = None,
     out: options.FolderOption = None,
+    resume: options.ResumeOption = None,
     force: options.ForceOption = False,
     figures: options.FiguresOption = True,
     as_json: options.JsonOption = False,
@@ -205,15 +208,40 @@ def compare(
     """Simulate the consensus laws and the optimization-based methods from the same starts."""
     from echelon.experiments.scenario.scenario import load_scenario
 
-    # First, so that `--set simulation.horizon` wins over it.
-    changes = [f"simulation.horizon={horizon!r}", *(set_ or [])]
-    loaded = [load_scenario(name, changes) for name in scenarios]
-    names = ", ".join(scenario.name for scenario in loaded)
-    minutes = ", which takes minutes" * (seeds is None)
-    STATUS.begin(f"comparing methods on {names}{minutes}", not as_json)
+    some = next(iter(scenarios or ()), None)
+    tables.check_inputs("comparison", some, resume, method, seeds, set_, out, force)
+    if resume is None:
+        # First, so that `--set simulation.horizon` wins over it.
+        changes = [f"simulation.horizon={horizon!r}", *(set_ or [])]
+        loaded = [load_scenario(name, changes) for name in scenarios or ()]
+        names = ", ".join(scenario.name for scenario in loaded)
+        minutes = ", which takes minutes" * (seeds is None)
+        STATUS.begin(f"comparing methods on {names}{minutes}", not as_json)
+        jobs, labels, drawn = _new_comparisons(loaded, method, seeds, out, force)
+    else:
+        jobs, labels, drawn = _unfinished_comparison(resume)
+    with STOP.hold():
+        rows = [_compare(*job, labels, drawn, figures, as_json, as_latex) for job in jobs]
+    if as_json:
+        print(json.dumps(rows[0] if len(rows) == 1 else rows, indent=2))
+    raise typer.Exit(STOP.exit_code)
+
+
+_Jobs: TypeAlias = "list[tuple[Scenario, Experiment, Path]]"
+"""Comparisons that are to be made, each with its folder."""
+
+
+def _new_comparisons(
+    loaded: "list[Scenario]",
+    method: list[str] | None,
+    seeds: str | None,
+    out: Path | None,
+    force: bool,
+) -> tuple[_Jobs, tuple[str, ...], Sequence[int] | None]:
     from echelon.experiments.scenario.build import build
     from echelon.experiments.studies.compare import known_labels, laws_of
     from echelon.output.archive.folder import claim_folders
+    from echelon.output.archive.study_folder import SeedBatches
 
     drawn = None if seeds is None else _read_seeds(seeds)
     labels = known_labels(method, slow=drawn is None)
@@ -221,14 +249,22 @@ def compare(
     for scenario, experiment in zip(loaded, experiments, strict=True):
         laws_of(scenario, experiment.parts, labels)
     folders = claim_folders([scenario.name for scenario in loaded], out, force)
-    with STOP.hold():
-        rows = [
-            _compare(*job, labels, drawn, figures, as_json, as_latex)
-            for job in zip(loaded, experiments, folders, strict=True)
-        ]
-    if as_json:
-        print(json.dumps(rows[0] if len(rows) == 1 else rows, indent=2))
-    raise typer.Exit(STOP.exit_code)
+    for scenario, folder in zip(loaded, folders, strict=True) if drawn is not None else ():
+        SeedBatches(folder).begin(scenario, labels, drawn or ())
+    return [*zip(loaded, experiments, folders, strict=True)], labels, drawn
+
+
+def _unfinished_comparison(folder: Path) -> tuple[_Jobs, tuple[str, ...], Sequence[int] | None]:
+    from echelon.output.archive.study_folder import SeedBatches
+
+    batches = SeedBatches(folder)
+    if not batches.chunks.exist and (folder / "comparison.json").is_file():
+        print(f"echelon: the comparison in `{folder}` is complete; nothing to do.")
+        raise typer.Exit()
+    scenario, labels, drawn = batches.begun()
+    from echelon.experiments.scenario.build import build
+
+    return [(scenario, build(scenario, to_run=True), folder)], labels, drawn
 
 
 def _read_seeds(text: str) -> Sequence[int]:
@@ -255,7 +291,7 @@ def _compare(
 ) -> "JsonObject":
     from echelon.experiments.studies.compare import compare as simulate
     from echelon.experiments.studies.seed_comparison import compare_seeds
-    from echelon.output.archive.study_folder import Flights, write_comparison
+    from echelon.output.archive.study_folder import Flights, SeedBatches, write_comparison
     from echelon.output.reports.comparison_report import (
         comparison_mapping,
         comparison_report,
@@ -266,19 +302,23 @@ def _compare(
         STATUS.count(done, methods, f"methods, now {label}")
         STOP.check()
 
-    flights = Flights(folder)
+    flights, batches = Flights(folder), SeedBatches(folder)
     STATUS.begin(f"comparing on {scenario.name}", not quiet)
-    comparison = (
-        simulate(scenario, experiment, labels, progress, flights.write)
-        if seeds is None
-        else compare_seeds(scenario, seeds, experiment, labels, progress)
-    )
+    with write_errors(folder):
+        comparison = (
+            simulate(scenario, experiment, labels, progress, flights.write)
+            if seeds is None
+            else compare_seeds(scenario, seeds, experiment, labels, progress, batches.store)
+        )
     # Printed before anything more is written, so that a full disk loses nothing of it.
     if not quiet:
         print_comparison(tables.console(as_latex=as_latex), comparison)
     flights.check()
     rows, text = comparison_mapping(comparison), comparison_report(comparison)
     write_comparison(comparison, rows, text, folder, figures)
+    if STOP.number is None:
+        batches.chunks.remove()
     if not quiet:
-        tables.print_folder(folder)
+        resume = f"`echelon compare --resume {folder}` continues" if batches.chunks.hold_any else ""
+        tables.print_folder(folder, resume)
     return rows

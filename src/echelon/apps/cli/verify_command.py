@@ -138,7 +138,9 @@ def _print(text: str) -> None:
 def _print_rows(title: str, rows: Iterable[Iterable[str]]) -> None:
     rows = list(rows)
     if rows:
-        table = tables.plain_table(_TITLES, rows)
+        from echelon.output.reports.check_report import plain_table
+
+        table = plain_table(_TITLES, rows)
         table.title, table.title_justify = title, "left"
         tables.console(_WIDTH).print(table)
 

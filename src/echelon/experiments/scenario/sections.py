@@ -66,8 +66,9 @@ class ModelSpec(Section, **either("name", "python")):
     """Name of a set of parameters, or the parameters in the model's units; with the key `set` they
     change those of the named set."""
     file: str | None = None
-    """MATLAB file of the model `linear`, relative to the scenario file: A and B, and where given C
-    and the step `Ts` of a discrete-time model."""
+    """File relative to the scenario file. MATLAB file of the model `linear`: A and B, and where
+    given C and the step `Ts` of a discrete-time model. URDF or MJCF file of the model `quadrotor`:
+    mass and inertia."""
     allow_unphysical: bool = False
     """Whether parameters that no rigid body can have are accepted."""
 

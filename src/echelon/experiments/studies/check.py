@@ -9,6 +9,7 @@ from jaxtyping import Float
 from echelon.agents.models.linearization import trim_slopes
 from echelon.agents.models.model import ControlAffine
 from echelon.core.digits import about, at_least, at_most
+from echelon.core.files import notebook_page
 from echelon.core.numerics import precision
 from echelon.core.statement import Statement, Topic, fails, holds, unneeded, vacuous
 from echelon.core.types import Array, JsonObject
@@ -216,6 +217,9 @@ class CheckResult(NamedTuple):
     promise: Guarantee
     warnings: tuple[str, ...] = ()
     region: ObservedRegion | None = None
+
+    def _repr_html_(self) -> str:
+        return notebook_page("report", self)
 
     @property
     def promised(self) -> bool:

@@ -9,6 +9,7 @@ import equinox as eqx
 import numpy as np
 
 from echelon.core.errors import EchelonError, LawError, ScenarioError, check_name
+from echelon.core.files import notebook_page
 from echelon.core.numerics import precision
 from echelon.core.words import Feedforward
 from echelon.experiments.results.metrics import RunNumbers, metrics
@@ -68,6 +69,9 @@ class Comparison(NamedTuple):
     horizon: float
     steady_window: float
     conditions: tuple[str, ...]
+
+    def _repr_html_(self) -> str:
+        return notebook_page("report", self)
 
 
 _LAW_NAMES = {

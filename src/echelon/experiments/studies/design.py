@@ -11,6 +11,7 @@ import numpy as np
 from echelon.agents.models.model import ControlAffine
 from echelon.core.digits import at_most
 from echelon.core.errors import EchelonError, GainError, ScenarioError, check_name
+from echelon.core.files import notebook_page
 from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis
 from echelon.core.words import Theorem
@@ -92,6 +93,9 @@ class Designs(NamedTuple):
     recommended: Design | None
     because: str
     settings: Settings
+
+    def _repr_html_(self) -> str:
+        return notebook_page("report", self)
 
 
 def design(

@@ -14,6 +14,7 @@ import scipy.special
 from jaxtyping import Float
 
 from echelon.core.errors import EchelonError, Outcome, SimulationError
+from echelon.core.files import notebook_page
 from echelon.core.numerics import precision
 from echelon.core.types import Array, JsonObject
 from echelon.experiments.results.metrics import arrived, metrics
@@ -91,6 +92,9 @@ class ObservedRegion(NamedTuple):
     unit: str
     limits: bool
     trials: tuple[ScaleTrial, ...]
+
+    def _repr_html_(self) -> str:
+        return notebook_page("report", self)
 
     @property
     def reached(self) -> ScaleTrial | None:

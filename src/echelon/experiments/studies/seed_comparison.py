@@ -1,5 +1,6 @@
 """Compares methods over many seeds: quantiles of their numbers, and paired differences."""
 
+import contextlib
 import itertools
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -9,6 +10,7 @@ import equinox as eqx
 import numpy as np
 
 from echelon.core.errors import EchelonError, LawError, Outcome
+from echelon.core.files import notebook_page
 from echelon.core.limits import excess_runs
 from echelon.core.types import Array
 from echelon.experiments.results.metrics import RunNumbers, arrived, metrics
@@ -33,6 +35,7 @@ LEVELS = (0.05, 0.5, 0.95)
 """The quantiles that are stated."""
 NUMBERS = tuple(shown_in(RUN_NUMBERS, Appearance.SEEDS))
 _COMPLETED, _REFUSED = Outcome.COMPLETED.name.lower(), "refused"
+_STOPPED = tuple(end.name.lower() for end in (Outcome.INTERRUPTED, Outcome.STOPPED))
 
 
 class MethodSeeds(NamedTuple):
@@ -73,6 +76,34 @@ class MethodSeeds(NamedTuple):
         return quantiles(self.ranked(name), LEVELS)
 
 
+class SeedRun(NamedTuple):
+    """A run of a method: how it ended, in one word; its `NUMBERS`; why it was refused; its unit."""
+
+    outcome: str
+    numbers: Sequence[float]
+    reason: str = ""
+    unit: str = ""
+
+
+class SeedStore(NamedTuple):
+    """Keeps the runs of a comparison, from which it can be continued.
+
+    Attributes:
+        read: returns the runs that were kept under a number; None if there are none.
+        write: keeps runs under a number.
+    """
+
+    read: Callable[[int], Sequence[SeedRun] | None] = lambda number: None
+    write: Callable[[int, Sequence[SeedRun]], None] = lambda number, runs: None
+
+    def after(self, first: int) -> "SeedStore":
+        """Return it with its numbers counted from another one on."""
+        return SeedStore(
+            lambda number: self.read(first + number),
+            lambda number, runs: self.write(first + number, runs),
+        )
+
+
 class PairedDifference(NamedTuple):
     """A number of a method minus that of another, seed by seed.
 
@@ -109,6 +140,9 @@ class SeedComparison(NamedTuple):
     rows: Sequence[MethodSeeds]
     horizon: float
     conditions: Sequence[str]
+
+    def _repr_html_(self) -> str:
+        return notebook_page("report", self)
 
     @property
     def length_unit(self) -> str:
@@ -185,6 +219,7 @@ def compare_seeds(
     built: Experiment | None = None,
     only: Sequence[str] = known_labels(None, slow=False),
     progress: Callable[[str, float, int], None] = lambda label, done, methods: None,
+    store: SeedStore = SeedStore(),
 ) -> SeedComparison:
     """Run each method on a scenario with the same seeds: the same starts, noise and messages.
 
@@ -194,6 +229,7 @@ def compare_seeds(
         built: its parts and settings; built if None.
         only: as in `compare`; by default the laws, without methods that optimize.
         progress: as in `compare`; the runs before an interruption are kept.
+        store: keeps runs, and gives those of an interrupted comparison of the same inputs.
 
     A run that diverges or is refused has no numbers, and counts as worse than all others.
 
@@ -209,9 +245,9 @@ def compare_seeds(
         def part(done: float) -> None:
             progress(label, len(rows) + done / len(seeds), len(only))
 
-        row, flown = _row(label, _results(batch, parts, scenes, drive, part))
-        rows.append(row)
-        return flown
+        flown, mine = list[Controller](), store.after(len(rows) * len(seeds))
+        rows.append(_row(label, _results(batch, parts, scenes, drive, part, mine, flown)))
+        return flown[0] if rows[-1].outcomes and flown else None
 
     run_each(scenario, parts, only, fly)
     return SeedComparison(scenario.name, seeds, rows, settings.horizon, conditions_of(parts))
@@ -235,19 +271,26 @@ def _results(
     scenes: Sequence[Run],
     drive: DriveOf,
     part: Callable[[float], None],
-) -> Iterator[Result | EchelonError]:
-    done = 0
+    store: SeedStore,
+    flown: list[Controller],
+) -> Iterator[SeedRun]:
+    """Yield the runs of a method, those that are kept without a computation; `flown` is its drive.
 
-    def report(_: int = 0, __: int = 0) -> None:
-        part(done)
-
-    report()
+    Batches are those of a comparison without an interruption, so that numbers agree to the bit.
+    """
+    part(0)
     runs, size = _runs(parts, scenes, drive), batch_size(parts, scenes[0][1])
+    with contextlib.suppress(EchelonError):  # of a drive that each run refuses
+        flown.append(runs[0][0].drive.prepare(parts.model, parts.graph.before))
     for first in range(0, len(runs), size):
-        for result in batch.fly(runs[first : first + size], report):
-            yield result
-            done += 1
-            report()
+        kept, found = store.read(first), list[SeedRun]()
+        mine = runs[first : first + size], lambda *_: part(first + len(found))
+        for run in map(_seed_run, batch.fly(*mine)) if kept is None else kept:
+            found.append(run)
+            yield run
+            part(first + len(found))
+        if kept is None:
+            store.write(first, found)
 
 
 def _runs(parts: Parts, scenes: Sequence[Run], drive: DriveOf) -> Sequence[Run]:
@@ -261,32 +304,30 @@ def _runs(parts: Parts, scenes: Sequence[Run], drive: DriveOf) -> Sequence[Run]:
     return [(own.replace(drive=drive(own, settings)), settings) for own, settings in scenes]
 
 
-def _row(
-    label: str, results: Iterator[Result | EchelonError]
-) -> tuple[MethodSeeds, Controller | None]:
-    """Return the runs of a method, and the drive of the first that was not refused."""
-    outcomes, numbers, reason, first = list[str](), list[list[float]](), "", None
+def _row(label: str, runs: Iterator[SeedRun]) -> MethodSeeds:
+    """Return the runs of a method, as many as there are before an interruption."""
+    found, failed = list[SeedRun](), ""
     try:
-        for result in results:
-            if isinstance(result, EchelonError):
-                reason = reason or str(result)
-            elif result.outcome in (Outcome.INTERRUPTED, Outcome.STOPPED):
+        for run in runs:
+            if run.outcome in _STOPPED:
                 raise KeyboardInterrupt
-            first = first or (result if isinstance(result, Result) else None)
-            numbers.append(_numbers(result))
-            outcomes.append(_word(result))
+            found.append(run)
     except EchelonError as error:
-        reason = str(error)
+        failed = str(error)
     except KeyboardInterrupt:
-        reason = INTERRUPTED
-    if first is None:
-        return MethodSeeds(label, reason=reason), None
-    columns = dict(zip(NUMBERS, np.array(numbers).T, strict=True))
-    return MethodSeeds(label, outcomes, columns, reason, first.length_unit), first.drive
+        failed = INTERRUPTED
+    reason = failed or next((run.reason for run in found if run.reason), "")
+    ran = [run for run in found if run.outcome != _REFUSED]
+    if not ran:
+        return MethodSeeds(label, reason=reason)
+    columns = dict(zip(NUMBERS, np.array([run.numbers for run in found]).T, strict=True))
+    return MethodSeeds(label, [run.outcome for run in found], columns, reason, ran[0].unit)
 
 
-def _word(result: Result | EchelonError) -> str:
-    return _REFUSED if isinstance(result, EchelonError) else result.outcome.name.lower()
+def _seed_run(result: Result | EchelonError) -> SeedRun:
+    if isinstance(result, EchelonError):
+        return SeedRun(_REFUSED, _numbers(result), str(result))
+    return SeedRun(result.outcome.name.lower(), _numbers(result), "", result.length_unit)
 
 
 def _numbers(result: Result | EchelonError) -> list[float]:

@@ -13,6 +13,7 @@ from echelon.experiments.results.run_numbers import AGENT_NUMBERS
 from echelon.guarantees.promises.promise import guarantee
 from echelon.output.plots.figure_files import html_image
 from echelon.output.plots.run_figures import figures
+from echelon.output.reports.html_report import html_table
 from echelon.output.reports.run_report import ends_farther, grows, labelled, observations
 from echelon.output.viewer.replay import replay_page
 from echelon.simulation.engine.result import Result
@@ -71,12 +72,7 @@ def _table(result: Result) -> str:
     unit = result.length_unit and f", {result.length_unit}"
     columns = (AGENT_NUMBERS[name].column.format(unit=unit) for name in _COLUMNS)
     heads = ("agent", *(column.replace("\n", " ") for column in columns))
-    rows = "".join(
-        f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in cells)}</tr>"
-        for cells in _cells(result)
-    )
-    head = "".join(f"<th>{title}</th>" for title in heads)
-    return f"<table><tr>{head}</tr>{rows}</table>"
+    return html_table([heads, *_cells(result)])
 
 
 def _cells(result: Result) -> Iterator[tuple[str, ...]]:

@@ -1,20 +1,30 @@
 """The folders of sweeps and comparisons: runs as they are computed, then datasets and figures."""
 
 import csv
+import hashlib
 import io
 import json
 import math
+import re
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, final
+
+import numpy as np
 
 from echelon.core.errors import OutputError
 from echelon.core.files import INPUTS, make_atomic, write_atomic
 from echelon.core.types import JsonObject
 from echelon.experiments.results.dataset import save_dataset
-from echelon.experiments.scenario.scenario import SCENARIO_FILE, load_scenario
+from echelon.experiments.scenario.scenario import SCENARIO_FILE, Scenario, load_scenario
 from echelon.experiments.studies.compare import Comparison, ComparisonRow
-from echelon.experiments.studies.seed_comparison import NUMBERS, SeedComparison
+from echelon.experiments.studies.seed_comparison import (
+    NUMBERS,
+    SeedComparison,
+    SeedRun,
+    SeedStore,
+)
 from echelon.experiments.sweeps.plan import Sweep, read_axes
 from echelon.experiments.sweeps.sweep_dataset import SweepBatch, axis_values, write_frames
 from echelon.output.archive.chunks import Chunks
@@ -23,7 +33,7 @@ from echelon.output.archive.folder import BATCHES, FRAMES, RUNS, write_errors
 if TYPE_CHECKING:
     import xarray as xr
 
-_OVER = "over.json"
+_OVER, _COMPARED = "over.json", "compared.json"
 
 
 @final
@@ -155,6 +165,66 @@ class Flights:
         with write_errors(self.folder):
             if self.error is not None:
                 raise self.error
+
+
+@final
+class SeedBatches:
+    """The runs of a comparison over seeds in its folder, from which it can be continued."""
+
+    def __init__(self, folder: Path) -> None:
+        self.chunks = Chunks(folder / RUNS, BATCHES)
+
+    @property
+    def store(self) -> SeedStore:
+        """What keeps runs here, and reads them."""
+        return SeedStore(self._read, self._write)
+
+    def begin(self, scenario: Scenario, methods: Sequence[str], seeds: Sequence[int]) -> None:
+        """Write the inputs, before anything is computed.
+
+        Raises:
+            OutputError: a file cannot be written.
+        """
+        inputs = {"methods": [*methods], "seeds": [*seeds], "laws": _digests(methods)}
+        with write_errors(self.chunks.folder):
+            self.chunks.place.mkdir(parents=True, exist_ok=True)
+        self.chunks.begin(scenario, {_COMPARED: json.dumps(inputs) + "\n"})
+
+    def begun(self) -> tuple[Scenario, tuple[str, ...], tuple[int, ...]]:
+        """Return the scenario, the methods and the seeds of the comparison that was begun here.
+
+        Raises:
+            OutputError: there is none, or its inputs or versions changed.
+        """
+        self.chunks.check()
+        folder = self.chunks.folder
+        inputs = json.loads((folder / INPUTS / _COMPARED).read_text("utf-8"))
+        now = _digests(inputs["methods"])
+        for file in (file for file, digest in inputs["laws"].items() if now[file] != digest):
+            raise OutputError(
+                f"`{file}` is not the file with which the comparison in `{folder}` began, so it "
+                "cannot be continued; begin a new one."
+            )
+        scenario = load_scenario(folder / SCENARIO_FILE)
+        return scenario, tuple(inputs["methods"]), tuple(inputs["seeds"])
+
+    def _read(self, number: int) -> list[SeedRun] | None:
+        stored = self.chunks.stored(number)
+        if stored is None:
+            return None
+        return [SeedRun(*run) for run in zip(*(stored[name].tolist() for name in SeedRun._fields))]
+
+    def _write(self, number: int, runs: Sequence[SeedRun]) -> None:
+        columns = dict(zip(SeedRun._fields, map(np.array, zip(*runs)), strict=True))
+        self.chunks.store(number, columns)
+
+
+def _digests(methods: Sequence[str]) -> dict[str, str]:
+    """Return the SHA-256 of the files of users' laws; empty where one cannot be read."""
+    files = (re.search(r"(?:python:\s*)?([^\"'{}]+\.py):", method) for method in methods)
+    named = [Path(found[1]) for found in files if found is not None]
+    content = ((file, file.read_bytes() if file.is_file() else b"") for file in named)
+    return {str(file): data and hashlib.sha256(data).hexdigest() or "" for file, data in content}
 
 
 def write_comparison(

@@ -42,11 +42,11 @@ def poles(loop: LoopPoles) -> "Figure":
     dots = ax.scatter(real.ravel(), imaginary.ravel(), 34, colour, **look)
     ax.axvline(0.0, color=draw.EDGE)
     slowest = float(real.max())
-    mark: draw.Style = draw.LIMIT | {"color": draw.COLOURS[1]}
+    mark: draw.Style = draw.LIMIT | {"color": draw.colour(1)}
     ax.axvline(slowest, **mark)
     _wide_axis(ax, real, imaginary)
     text = f"slowest: {at_least(slowest)} 1/s".replace("-", "\u2212")
-    ax.set_title(text, color=draw.COLOURS[1], loc="right")
+    ax.set_title(text, color=draw.colour(1), loc="right")
     # A single eigenvalue needs no colour scale.
     if len(np.unique(values)) > 1:
         bar = figure.colorbar(dots, ax=ax, pad=0.02, aspect=30)
@@ -247,6 +247,7 @@ def _links(
     from matplotlib.collections import LineCollection, PolyCollection
 
     wide = np.clip(1.6 * np.sqrt(weights / run.weights.max()), 0.3, 1.6) * small
+    wide *= draw.scale("lines.linewidth")
     present, inactive = weights > 0.0, ~run.heard.any(axis=1)
     for mask, dash in ((present & ~inactive, "-"), (present & inactive, (0, (1.0, 2.0)))):
         lines = [curves[k] for k in np.flatnonzero(mask)]

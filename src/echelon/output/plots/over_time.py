@@ -170,10 +170,10 @@ def bands(
     if floor is not None:
         # Of all values: without those below it the quantiles of the others would be higher.
         ends[:2], ends[2:] = np.maximum(ends[:2], floor), above(ends[2:], floor)
-    look = {"color": draw.COLOURS[0], "linewidth": 0.0, "zorder": 1.5}
+    look = {"color": draw.colour(0), "linewidth": 0.0, "zorder": 1.5}
     ax.fill_between(times, ends[0], ends[4], alpha=0.18, label="5 to 95 %", **look)
     ax.fill_between(times, ends[1], ends[3], alpha=0.35, label="25 to 75 %", **look)
-    draw.plot(ax, times, ends[2], label=f"median {of}", color=draw.COLOURS[0])
+    draw.plot(ax, times, ends[2], label=f"median {of}", color=draw.colour(0))
 
 
 def tracking(run: Recording) -> "Figure | None":
@@ -252,7 +252,7 @@ def _worst(
     with np.errstate(over="ignore", invalid="ignore"):
         place = int(np.argmax((errors[steady if steady.any() else ...] ** 2).sum(axis=0)))
     name = f"worst: follower {run.followers[place]}"
-    pen = {"color": draw.COLOURS[1], "zorder": 3}
+    pen = {"color": draw.colour(1), "zorder": 3}
     draw.plot(ax, times, above(errors[keep, place], floor), label=name, **pen)
     largest = above(errors[keep].max(axis=1), floor)
     draw.plot(ax, times, largest, label="largest at each time", linestyle=":", **pen)
@@ -380,7 +380,7 @@ def distances(run: Recording) -> "Figure | None":
         if closest is not None:
             text = "{}: {} and {}".format(f"{closest.distance:.3g} m", *closest.agents)
             where = np.array([closest.time]), np.array([closest.distance])
-            draw.plot(ax, *where, label=text, **draw.dots("o", draw.COLOURS[1], 4.0))
+            draw.plot(ax, *where, label=text, **draw.dots("o", draw.colour(1), 4.0))
         if run.radius is not None:
             ax.axhline(2.0 * run.radius, label="agents touch", **draw.LIMIT)
         ax.set_ylabel(draw.label("smallest distance", "m"))

@@ -53,7 +53,7 @@ _TICKS, _COUNTED = 9, 100
 """Most values named at an axis of a map, and most cells with their counts."""
 _MOST = 500
 _LOST, _CONVERGED = "#F0C9A8", "#CFE3F1"  # pale, under the outlines of the sets
-_CERTIFIED, _OBSERVED = draw.COLOURS[2], draw.COLOURS[0]
+_CERTIFIED, _OBSERVED = 2, 0
 
 
 def comparison_figures(comparison: Comparison) -> "dict[str, Figure]":
@@ -196,10 +196,10 @@ def _paper_figure(scenario: str, runs: _Runs) -> "Figure | None":
     for (method, run), dash in zip(found.items(), ("-", (0, (3.0, 1.2))), strict=True):
         assert run is not None
         errors, keep = distance_errors(run), draw.thin(len(run.times))
-        for k, colour in enumerate(draw.COLOURS[: errors.shape[1]]):
+        for k in range(errors.shape[1]):
             name = f"$e_{{F{k + 1}}}$ {method}"
             line = errors[keep, k]
-            draw.plot(ax, run.times[keep], line, label=name, color=colour, linestyle=dash)
+            draw.plot(ax, run.times[keep], line, label=name, color=draw.colour(k), linestyle=dash)
     ax.set(xlim=(0.0, HORIZON), xlabel="time (s)")
     ax.set_ylabel(draw.label("distance, actual less desired", first.length_unit))
     return draw.finish(figure)
@@ -288,7 +288,7 @@ def _success(data: "xr.Dataset", keys: list[str]) -> "Figure":
         values, rate = settled[key].values, settled.values / np.maximum(1, runs.values)
         low, high = share_bounds(settled.values, np.maximum(1, runs.values))
         bars = np.abs(np.stack([rate - low, high - rate]))
-        ax.errorbar(values, rate, bars, color=draw.COLOURS[0], fmt="o:", markersize=3, capsize=2)
+        ax.errorbar(values, rate, bars, color=draw.colour(0), **_dotted())
         _name_values(ax, "x", values)
         ax.set_xlabel(_label(data, key))
         ax.set_ylim(-0.03, 1.03)
@@ -462,21 +462,26 @@ def certified_scale(parts: Parts, radius: float, region: ObservedRegion) -> floa
     return radius / np.sqrt(largest)
 
 
+def _dotted() -> draw.Style:
+    """Return the look of shares with their bars."""
+    return {"fmt": "o:", "markersize": 3.0 * draw.scale("lines.markersize"), "capsize": 2}
+
+
 def _failing(ax: "Axes", region: ObservedRegion, certified: float | None) -> None:
     """Draw the share of random starts that fail over the scale, and its bound at 95 %."""
     scales, runs = [x.scale for x in region.trials], [x.runs for x in region.trials]
     share = np.array([x.failed for x in region.trials]) / runs
     above = np.array([x.bound for x in region.trials]) - share
     bars = np.stack([np.zeros(len(share)), above])
-    look: draw.Style = {"color": _OBSERVED, "fmt": "o:", "markersize": 3, "capsize": 2}
+    look: draw.Style = {"color": draw.colour(_OBSERVED), **_dotted()}
     label = f"of {runs[0]} starts, bound 95 %"
     ax.errorbar(scales, share, bars, label=label, **look)
     if certified and certified < np.inf:
-        ax.axvline(certified, color=_CERTIFIED, label="certified (leader at rest)")
+        ax.axvline(certified, color=draw.colour(_CERTIFIED), label="certified (leader at rest)")
     _name_values(ax, "x", np.array(scales))
     ax.set(xlabel="scale of the starts' spreads", ylabel="share of runs that fail")
     ax.set_ylim(-0.03, 1.03)
-    ax.legend(loc="best", fontsize="x-small")
+    ax.legend(loc="best")
 
 
 def _starts(ax: "Axes", run: Trial, plane: StateSlice, half: Array) -> None:
@@ -489,16 +494,17 @@ def _starts(ax: "Axes", run: Trial, plane: StateSlice, half: Array) -> None:
     colours = ListedColormap([_LOST, _CONVERGED])
     look = {"cmap": colours, "vmin": 0.0, "vmax": 1.0, "rasterized": True, "zorder": 0}
     ax.pcolormesh(x, y, inside.astype(float), shading="nearest", **look)
-    ax.plot(0.0, 0.0, **draw.dots("+", draw.EDGE, 6.0))
+    draw.plot(ax, np.zeros((1, 2)), **draw.dots("+", draw.EDGE, 6.0))
     ax.grid(False)
     ax.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
 
 
 def _ellipses(ax: "Axes", plane: StateSlice, radii: Radii, half: Array) -> None:
     """Draw the certified and the observed set, if they fit into the axes."""
-    ellipses: list[Any] = [(radii.observed, _OBSERVED, (0, (5, 2)), "none")]
+    ellipses: list[Any] = [(radii.observed, draw.colour(_OBSERVED), (0, (5, 2)), "none")]
     if radii.certified and radii.certified < np.inf:
-        ellipses.append((radii.certified, _CERTIFIED, "-", _CERTIFIED))
+        ink = draw.colour(_CERTIFIED)
+        ellipses.append((radii.certified, ink, "-", ink))
     for radius, colour, dash, fill in ellipses:
         if not radius or (plane.extents(radius) < 0.004 * half).any():
             continue
@@ -520,11 +526,11 @@ def _legend(figure: "Figure", ax: "Axes", radii: Radii, run: Trial) -> None:
         certified = "certified everywhere" if radii.certified == np.inf else certified
     observed = f"observed: all tested starts converge, r = {at_most(radii.observed)}"
     lost = f"error not below {100.0 * run.decay:.2g} % after {run.horizon:.3g} s"
-    ink = _CERTIFIED if radii.certified else "none"
+    ink = draw.colour(_CERTIFIED) if radii.certified else "none"
     border: dict[str, Any] = {"edgecolor": "0.7"}
     handles: list[Any] = [
         Line2D([], [], color=ink, label=certified),
-        Line2D([], [], color=_OBSERVED, linestyle=(0, (5, 2)), label=observed),
+        Line2D([], [], color=draw.colour(_OBSERVED), linestyle=(0, (5, 2)), label=observed),
         Patch(facecolor=_CONVERGED, label="converges, leader at rest", **border),
         Patch(facecolor=_LOST, label=lost, **border),
     ]

@@ -39,6 +39,8 @@ _TOP = 1e9  # of a logarithmic axis; above it the interesting part would be flat
 _POINTS = 2000  # of a line, more than the pixels that it covers
 _ALL_POINTS = 200_000  # of all lines of one figure
 
+_SIZES = ("linewidth", "markersize")
+
 Style: TypeAlias = dict[str, Any]
 """Keywords of matplotlib."""
 
@@ -102,11 +104,12 @@ def style(page: FigureSize = SCREEN, ax: "Axes | None" = None) -> Iterator[None]
     """
     matplotlib = _matplotlib()
     ours, usual = matplotlib.rcParams, matplotlib.rcParamsDefault
-    settings = {key: value for key, value in STYLE.items() if ours[key] == usual[key]}
+    looks = STYLE | {"font.size": page.letters}
+    settings = {key: value for key, value in looks.items() if ours[key] == usual[key]}
     token, into = _page.set(page), _target.set(ax)
     try:
         with (
-            matplotlib.rc_context(settings | {"font.size": page.letters}),
+            matplotlib.rc_context(settings),
             np.errstate(over="ignore", invalid="ignore"),
         ):
             yield
@@ -152,6 +155,27 @@ LIMIT: Style = {"color": EDGE, "linestyle": (0, (5.0, 2.0)), "zorder": 2.2}
 """A limit or a guarantee."""
 
 
+def scale(key: str) -> float:
+    """Return by how much the user's setting, as of `lines.linewidth`, is larger than echelon's."""
+    return _matplotlib().rcParams[key] / STYLE[key]
+
+
+def hue(place: int) -> Style:
+    """Return the colour of a line by its place: of the palette, or as the user's cycle has it."""
+    matplotlib = _matplotlib()
+    cycle = matplotlib.rcParams["axes.prop_cycle"]
+    if cycle == matplotlib.rcParamsDefault["axes.prop_cycle"] or "color" not in cycle.keys:
+        return {"color": COLOURS[place % len(COLOURS)]}
+    looks = [*cycle]
+    look = looks[place % len(looks)]
+    return {key: look[key] for key in ("color", "linestyle", "linewidth") if key in look}
+
+
+def colour(place: int) -> Any:
+    """Return the colour of `hue`."""
+    return hue(place)["color"]
+
+
 def crowding(agents: int) -> float:
     """Return 1 for as many agents as a legend can name, and less for more."""
     return min(1.0, NAMED / agents)
@@ -166,9 +190,9 @@ def leader_pen(place: int, agents: int) -> Style:
 def pen(place: int, agents: int) -> Style:
     """Return the line style of a follower, by its place among the followers."""
     if (crowd := crowding(agents)) < 1.0:
-        return {"color": COLOURS[0], "alpha": crowd**0.5, "rasterized": agents > 100}
-    again, hue = divmod(place, len(COLOURS))
-    return {"color": COLOURS[hue], "linestyle": _DASHES[(hue + 3 * again) % len(_DASHES)]}
+        return {"color": colour(0), "alpha": crowd**0.5, "rasterized": agents > 100}
+    again, one = divmod(place, len(COLOURS))
+    return {"linestyle": _DASHES[(one + 3 * again) % len(_DASHES)], **hue(place)}
 
 
 def pen_of(run: Recording, agent: int) -> Style:
@@ -232,12 +256,16 @@ def dots(shape: str, colour: str, size: float = 5.0, hollow: bool = False) -> St
 
 
 def plot(ax: "Axes", *columns: Array, **look: Any) -> None:
-    """Draw a line through points, given as arrays (T, k) of coordinates; one point as a dot."""
+    """Draw a line through points, given as arrays (T, k) of coordinates; one point as a dot.
+
+    Widths and sizes are those at echelon's settings, in whose proportions a user's are drawn.
+    """
     points = np.column_stack(columns)
     if len(points) == 1 and "marker" not in look:
         look |= {"marker": "o", "markersize": 4.0}
+    sized = {key: look[key] * scale(f"lines.{key}") for key in _SIZES if key in look}
     # The box of a space extends beyond its axes.
-    ax.plot(*points.T, clip_on=ax.name != "3d", **look)
+    ax.plot(*points.T, clip_on=ax.name != "3d", **(look | sized))
 
 
 def thin(frames: int, lines: int = 1) -> Array:
@@ -437,7 +465,8 @@ def finish(figure: "Figure", cut: bool = False) -> "Figure":
 
     for ax in figure.axes:
         # Ticks are chosen by the font size, which a later style must not change.
-        ax.tick_params(labelsize=matplotlib.rcParams["xtick.labelsize"])
+        ax.tick_params("x", labelsize=matplotlib.rcParams["xtick.labelsize"])
+        ax.tick_params("y", labelsize=matplotlib.rcParams["ytick.labelsize"])
     figure.align_ylabels()
     # Axes of equal scales change their shape, and so the places of labels, with each pass.
     engine: Any = figure.get_layout_engine()

@@ -2,14 +2,18 @@
 
 import enum
 import textwrap
-from collections.abc import Iterator, Sequence
-from typing import final
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, final
 
 from echelon.core.statement import Hypothesis, Statement, Topic
 from echelon.core.words import Verdict, amount
 from echelon.experiments.studies.check import CheckResult
 from echelon.output.reports.guarantee_text import WIDTH, guarantee_lines
 from echelon.output.reports.region_report import region_report
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
 
 HEIGHT = 40
 """Lines of a terminal."""
@@ -102,3 +106,31 @@ def _row(line: Statement, width: int, short: bool, brief: bool) -> Iterator[str]
 
 def _wrapped(text: str, first: str, later: str) -> list[str]:
     return textwrap.wrap(text, WIDTH, initial_indent=first, subsequent_indent=later)
+
+
+# ---- all lines -----------------------------------------------------------------------------------
+
+
+def print_statements(out: "Console", check: CheckResult) -> None:
+    """Print sentences and all statements, each on one line where the output is no terminal."""
+    flat = not out.is_terminal
+    for sentence in check_sentences(check):
+        out.print(sentence, highlight=False, markup=False, soft_wrap=flat)
+    heads = ("statement", "verdict", "kind", "number", "reason, or what to change")
+    for title, lines in grouped(check.lines).items():
+        rows = ((x.name, x.shown_verdict, str(x.kind), x.number_text, x.explanation) for x in lines)
+        out.print(f"\n{title}:", highlight=False, markup=False)
+        out.print(plain_table(heads, rows), soft_wrap=flat)
+
+
+def plain_table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> "Table":
+    """Return rows of plain text as a table."""
+    from rich import box
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for column in columns:
+        table.add_column(column)
+    for row in rows:
+        table.add_row(*(text.replace("[", "\\[") for text in row))
+    return table

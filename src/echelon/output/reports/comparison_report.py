@@ -187,6 +187,8 @@ def _remarks(row: ComparisonRow) -> Iterator[str]:
 def verdict(comparison: Comparison) -> tuple[str, ...]:
     """Return which method wins by which number, one sentence each."""
     runs = [row for row in comparison.rows if row.flight is not None]
+    if not runs:
+        return ("No method ran.",)
     settled = [row for row in runs if row.number("worst_settling_time") is not None]
     some = 0 < len(settled) < len(runs)
     # Among others that do not settle, one alone is compared with nothing.

@@ -17,15 +17,21 @@ _LETTERS = {
 def latex(table: Table) -> str:
     """Return a table as a `tabular`, with its title as a comment."""
     sides = "".join("r" if column.justify == "right" else "l" for column in table.columns)
-    rows = [[_plain(column.header) for column in table.columns]]
-    rows += [[_plain(cell) for cell in row] for row in zip(*(c.cells for c in table.columns))]
-    lines = [" & ".join(map(_escaped, row)) + r" \\" for row in rows]
-    title = [f"% {_plain(table.title)}"] if table.title else []
+    lines = [" & ".join(map(_escaped, row)) + r" \\" for row in cells_of(table)]
+    title = [f"% {plain(table.title)}"] if table.title else []
     body = [r"\hline", lines[0], r"\hline", *lines[1:], r"\hline"]
     return "\n".join([*title, rf"\begin{{tabular}}{{{sides}}}", *body, r"\end{tabular}"])
 
 
-def _plain(cell: object) -> str:
+def cells_of(table: Table) -> list[list[str]]:
+    """Return the heads and the rows of a table as plain text."""
+    rows = zip(*(column.cells for column in table.columns))
+    heads = [plain(column.header) for column in table.columns]
+    return [heads, *([plain(cell) for cell in row] for row in rows)]
+
+
+def plain(cell: object) -> str:
+    """Return a cell without markup, on one line."""
     text = cell if isinstance(cell, Text) else Text.from_markup(str(cell))
     return " ".join(text.plain.split())
 

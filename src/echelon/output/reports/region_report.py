@@ -28,11 +28,7 @@ def region_report(region: ObservedRegion) -> str:
     lines = ["observed region of attraction (simulated, no proof):"]
     for sentence in region_sentences(region):
         lines += textwrap.wrap(sentence, _WIDTH, initial_indent=" ", subsequent_indent=" ")
-    rows = [
-        (f"{x.scale:g}", f"{x.failed} of {x.runs}", _bound(x), _why(x, region))
-        for x in region.trials
-    ]
-    rows = [("scale", "failed", "probability (95 %)", "how they failed"), *rows]
+    rows = region_rows(region)
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)][:3]
     for row in rows:
         cells = [f"{row[0]:>{widths[0]}}", *(f"{x:<{w}}" for x, w in zip(row[1:3], widths[1:]))]
@@ -41,6 +37,15 @@ def region_report(region: ObservedRegion) -> str:
             row[3], _WIDTH, initial_indent=first, subsequent_indent=" " * len(first)
         ) or [first.rstrip()]
     return "\n".join(line.rstrip() for line in lines)
+
+
+def region_rows(region: ObservedRegion) -> list[tuple[str, ...]]:
+    """Return the trials of a region as rows of a table, after its heads."""
+    rows = [
+        (f"{x.scale:g}", f"{x.failed} of {x.runs}", _bound(x), _why(x, region))
+        for x in region.trials
+    ]
+    return [("scale", "failed", "probability (95 %)", "how they failed"), *rows]
 
 
 def region_sentences(region: ObservedRegion) -> Iterator[str]:
