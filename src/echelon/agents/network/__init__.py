@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from echelon.agents.network.events import Cut, Join, Lose
+from echelon.agents.network.events import Cut, Event, Join, Lose
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.formation_motion import OffsetMotion, Reshape, Rotate, Scale
 from echelon.agents.network.graph import Graph
@@ -11,6 +11,7 @@ from echelon.core.gone import no_name
 
 __all__ = [
     "Cut",
+    "Event",
     "Formation",
     "Graph",
     "Join",

@@ -34,6 +34,7 @@ from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.motion import IdealMotors, LaggingMotors, PlantStep
 from echelon.simulation.step.records import LoopState
 from echelon.simulation.step.roster import Everybody, Links, SwitchingLinks
+from echelon.simulation.step.run_laws import feedforward_of
 from echelon.simulation.step.sequence import begin, step
 
 # ---- leaders at rest -----------------------------------------------------------------------------
@@ -83,8 +84,13 @@ class RestingLeader(Law, Travels, Speaks):
         period: Scalar | float,
     ) -> Expected:
         """Return what it says at its trim, with the deviation."""
-        x = _trim_at(model, t, self.travel)
-        return Expected(deviation + self._said(model, x, jnp.zeros_like(x), self.begin(model, x)))
+        x, still = _trim_at(model, t, self.travel), jnp.zeros(len(model.input_names))
+        memory = self.begin(model, x)
+        said = self._said(model, x, jnp.zeros_like(x), memory)
+        if not Speaks.may(self.follower, "signal"):
+            return Expected(deviation + said)
+        # A signal is no state, from which its law could act.
+        return Expected(deviation + said, feedforward_of(self.follower, model, x, still, memory))
 
     def _said(self, model: ControlAffine, x: State, offset: State, memory: Memory) -> jax.Array:
         said = self.signal(model, x, offset, memory)
