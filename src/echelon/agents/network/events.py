@@ -7,53 +7,17 @@ import dataclasses
 import math
 import numbers
 from collections.abc import Iterator, Sequence
-from typing import ClassVar, NamedTuple, final
+from typing import NamedTuple, final
 
 import numpy as np
 
 from echelon.agents.network.edges import name_agents
 from echelon.agents.network.matrices import GraphMatrices, nearest_leaders, unreached
 from echelon.agents.network.switching import Schedule
+from echelon.agents.part import Event
 from echelon.core.errors import GraphError, is_number
 from echelon.core.trace import error_summary
 from echelon.core.types import Array
-
-
-class Event:
-    """What happens to a formation at a time; all others ask an event about itself here.
-
-    One of your own is a frozen dataclass with the field `at`, s. From then to its `end` edges have
-    the weights of `carried`.
-    """
-
-    at: float
-    comes: ClassVar[bool | None] = None
-    """Whether its agent is there from then on, or is not; None where nobody comes or goes."""
-
-    @property
-    def agents(self) -> tuple[int, ...]:
-        """The agents that it is about."""
-        return ()
-
-    @property
-    def end(self) -> float:
-        """When it ends, s."""
-        return math.inf
-
-    def faults(self, graph: GraphMatrices) -> Iterator[str]:
-        """Yield what does not fit the graph, which has no events yet."""
-        yield from ()
-
-    def carried(self, graph: GraphMatrices, weights: Array) -> Array:
-        """Return the weights (E,) of edges while it lasts, from those without it."""
-        return weights
-
-    def uncovered(self, graph: GraphMatrices) -> str:
-        """Return why no guarantee covers it; empty if one may, as of a graph that switches."""
-        return f"{self} at {self.at:g} s, and no theorem is about that"
-
-    def __str__(self) -> str:
-        return f"`{type(self).__name__}` happens"
 
 
 @final

@@ -23,7 +23,7 @@ from echelon.agents.network.edges import (
     pairs_within,
     split_weights,
 )
-from echelon.agents.network.events import Event, check_backups, event_faults, schedule_of
+from echelon.agents.network.events import check_backups, event_faults, schedule_of
 from echelon.agents.network.graph_file import FileEdges, number_nodes, read_graph
 from echelon.agents.network.matrices import (
     GraphMatrices,
@@ -41,6 +41,7 @@ from echelon.agents.network.spectrum import (
     symmetric_spectrum,
 )
 from echelon.agents.network.switching import Schedule, Stretch, unite
+from echelon.agents.part import Event
 from echelon.core.errors import GraphError, check_kind
 from echelon.core.types import Array, PathLike
 from echelon.core.words import amount

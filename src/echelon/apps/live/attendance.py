@@ -7,9 +7,10 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from echelon.agents.network.events import Event, Join, Lose
+from echelon.agents.network.events import Join, Lose
 from echelon.agents.network.formation_motion import Reshape
 from echelon.agents.network.graph import Graph
+from echelon.agents.part import Event
 from echelon.core.errors import SimulationError
 from echelon.core.types import Array, JsonObject
 from echelon.simulation.engine.parts import Parts

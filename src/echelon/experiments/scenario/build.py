@@ -11,11 +11,11 @@ import numpy as np
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
 from echelon.agents.network.channel import Bursts, Network
-from echelon.agents.network.events import Cut, Event, Join, Lose, check_backups, event_faults
+from echelon.agents.network.events import Cut, Join, Lose, check_backups, event_faults
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.formation_motion import OffsetMotion, Reshape, Rotate, Scale
 from echelon.agents.network.graph import Graph
-from echelon.agents.part import WorldPart
+from echelon.agents.part import Event, WorldPart
 from echelon.agents.references.reference import LeaderPath, Reference, check_reference
 from echelon.agents.references.slowed_path import slowed
 from echelon.agents.world.actuator import Actuator

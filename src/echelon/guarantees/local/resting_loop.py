@@ -32,6 +32,7 @@ from echelon.simulation.step.assembly import assemble
 from echelon.simulation.step.drive import Problem
 from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.motion import IdealMotors, LaggingMotors, PlantStep
+from echelon.simulation.step.own_members import own_classes
 from echelon.simulation.step.records import LoopState
 from echelon.simulation.step.roster import Everybody, Links, SwitchingLinks
 from echelon.simulation.step.run_laws import feedforward_of
@@ -237,7 +238,7 @@ def _flow(X: jax.Array) -> jax.Array:
 def held_exactly(loop: Loop) -> Loop | None:
     """Return the loop whose plants move by the exact flow; None where they have another step."""
     motion = loop.motion
-    if type(motion) is not PlantStep or motion.integrator == "printed":
+    if motion.integrator == "printed" or any(own_classes(motion)):
         return None
     rows = motion.rows if motion.rows == () else (motion.rows[0], HeldExactly(motion.rows[1]))
     return loop.replace(

@@ -15,8 +15,8 @@ from echelon.agents.models.linearization import at_trim
 from echelon.agents.models.model import ControlAffine, position_unit
 from echelon.agents.models.model_check import Shortfall, at_limits, is_limited, trim_shortfall
 from echelon.agents.models.relative_equilibrium import trim_speed, trim_velocity
-from echelon.agents.network.events import Event
 from echelon.agents.network.graph import Graph
+from echelon.agents.part import Event
 from echelon.agents.world.actuator import Actuator
 from echelon.core.compiled import compiled_for_one_call
 from echelon.core.digits import about, at_least
