@@ -62,6 +62,10 @@ class WorldPart:
         """Return what theorems may bound of it."""
         return Effects()
 
+    def unflown(self) -> str:
+        """Return why `echelon fly` refuses it, and what to do; empty where agents fly with it."""
+        return "" if self.key else f"`{type(self).__name__}` is not in a flight; leave it out"
+
     def words(self, model: ControlAffine) -> str:
         """Return it in words, for data."""
         return str(self)
