@@ -15,6 +15,7 @@ import echelon as ech
 from echelon.agents.network.channel import Channel
 from echelon.agents.world.sensing import SensorStage
 from echelon.core.errors import EchelonError
+from echelon.output.archive.flight_folder import flight_files
 from echelon.simulation.step.motion import IdealMotors
 
 DT, STEPS = 0.02, 60
@@ -260,6 +261,14 @@ def test_of_a_part_that_says_nothing_nothing_is_proved(network):
         str(ech.guarantee(parts.replace(world=ech.World(network=radio)), settings).kind) == "proof"
     )
     assert str(ech.guarantee(parts.replace(world=world), settings).verdict) == "none"
+
+
+def test_a_flight_refuses_what_its_vehicles_lack():
+    radio = ech.Network(rate=50.0)
+    for part, name in ((Sensed(SlowSensor()), "Sensed"), (Jammed(0, 9), "Jammed")):
+        world = ech.World(network=radio, parts=[part])
+        with pytest.raises(EchelonError, match=f"`{name}` is not in a flight; leave it out"):
+            flight_files(carts("stopping-point").replace(world=world), ech.Settings(1.0, DT), "")
 
 
 def test_a_part_of_your_own_is_no_subclass_of_echelons():
