@@ -80,7 +80,10 @@ def test_every_number_of_a_scenario_has_a_unit_and_every_key_a_sentence():
     schema = json_schema()
     for name, part in (*schema["$defs"].items(), ("file", schema)):
         for key, what in part["properties"].items():
-            others = ("GraphSpec", "edges"), ("MotionSpec", "parameters")
+            others = (
+                ("GraphSpec", "edges"),
+                *((x, "parameters") for x in ("MotionSpec", "EventSpec")),
+            )
             if name not in ("file", "UserClass") and (name, key) not in others:
                 assert "unit" in what or not numbers_of(what), (name, key)
             assert "description" in what or "$ref" in repr(what), (name, key)

@@ -14,6 +14,7 @@ from browser import chromium, opened, until
 from recordings import recorded
 
 import echelon as ech
+from echelon.agents.network.channel import NEVER
 from echelon.apps.live import guarantee_status
 from echelon.apps.live import server as served
 from echelon.apps.live import swarm as looked
@@ -320,6 +321,40 @@ def test_a_graph_that_switches_is_live_by_its_schedule(monkeypatch):
         wanted = ech.simulate(parts.replace(initial=swarm.states, start_error={}), settings)
         swarm.apply(knobs)
         np.testing.assert_allclose(flown(swarm, 30), wanted.states[1:], atol=1e-11)
+
+
+MUTE = """
+import dataclasses
+import echelon as ech
+
+
+class Silence(ech.Channel):
+    def post(self, posts, step, content, sends, receivers, senders):
+        return super().post(posts, step, content, sends & False, receivers, senders)
+
+
+@dataclasses.dataclass(frozen=True)
+class Mute(ech.WorldPart):
+    def member(self, loop):
+        return loop.with_medium(Silence(**vars(loop.network.medium)))
+"""
+
+
+@pytest.mark.slow
+def test_a_medium_of_your_own_stays_after_a_change_of_the_network(tmp_path):
+    (tmp_path / "mute.py").write_text(MUTE)
+    more = {"network": {"rate": 50, "messages": "state"}, "parts": [{"python": "mute.py:Mute"}]}
+    own = scenario_from_mapping(copy.deepcopy(GIVEN) | more, tmp_path)
+    panel = Panel(own, build(own))
+    swarm = LiveLoop(*panel.experiment, panel.live)
+    swarm.apply(panel.start._replace(loss=0.2))
+    swarm.advance()
+    assert (np.asarray(swarm.now.memory.network[1].stamp) == NEVER).all()
+
+
+def test_an_event_of_your_own_does_not_happen_live():
+    with pytest.raises(SimulationError, match="the event `far.py:Far` cannot happen live"):
+        as_changes([{"at": 1.0, "python": "far.py:Far"}])
 
 
 def test_a_loop_goes_on_from_the_last_state_of_a_run(swarm):

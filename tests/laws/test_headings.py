@@ -188,7 +188,10 @@ def test_who_joins_a_formation_that_has_turned_does_not_make_up_for_it(network):
     events = [ech.network.Join(2, joins)]
     parts = stopping(Carrier(), reference=SPINNING, network=network, events=events)
     parts = parts.replace(initial={2: [-1.2, 0.0, 0.0]})
-    result = ech.simulate(parts, SETTINGS._replace(horizon=14.0))
+    settings = SETTINGS._replace(horizon=14.0)
+    result, other = (ech.simulate(parts, settings._replace(engine=e)) for e in ("jax", "native"))
+    np.testing.assert_allclose(other.states, result.states, rtol=1e-13, atol=1e-12)
+    assert other.engine == "native"
     times, yaw = np.asarray(result.times), np.asarray(result.states)[:, 2, 2]
     after = times >= joins + 0.5
     # It turns with the leader from 0 rad on, which is where the leader is at 12.566 s.

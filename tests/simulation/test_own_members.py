@@ -1,4 +1,4 @@
-"""Members of a user's own: a sensor, a medium and motors that echelon does not know."""
+"""A user's own sensor, medium, motors and event, of which echelon knows what they say."""
 
 import dataclasses
 import pathlib
@@ -15,6 +15,7 @@ import echelon as ech
 from echelon.agents.network.channel import Channel
 from echelon.agents.world.sensing import SensorStage
 from echelon.core.errors import EchelonError
+from echelon.output.archive.flight_folder import flight_files
 from echelon.simulation.step.motion import IdealMotors
 
 DT, STEPS = 0.02, 60
@@ -56,6 +57,16 @@ class JammedMedium(Channel):
     def post(self, posts, step, content, sends, receivers, senders):
         quiet = (step >= self.silent) & (step < self.speaks)
         return super().post(posts, step, content, sends & ~quiet, receivers, senders)
+
+
+class MeanSensor(SensorStage):
+    """The mean of two measurements."""
+
+    def begin(self, model, x):
+        return x
+
+    def read(self, model, memory, x, clock, number):
+        return 0.5 * (memory + x), x
 
 
 class GrowingSensor(SensorStage):
@@ -203,3 +214,152 @@ def test_a_member_whose_memory_changes_its_form_is_told_with_its_line():
         flown(agreeing(parts=[3]))
     with pytest.raises(EchelonError, match="`parts` is a `int`, and must be a list"):
         flown(agreeing(parts=3))
+
+
+def test_motors_that_weaken_are_not_judged_by_the_flow_of_others():
+    parts = carts("consensus").replace(world=ech.World(parts=[Driven(WeakeningMotors())]))
+    found = ech.guarantee(parts, ech.Settings(horizon=1.0, dt=DT))
+    assert str(found.verdict) == "none" and "move exactly" not in in_words(found)
+
+
+@pytest.mark.slow
+def test_over_a_radio_the_certificate_is_of_a_sensor_that_counts_nothing():
+    """Echelon's own network counts steps, and a mean of two measurements does not."""
+    world = ech.World(network=ech.Network(rate=50.0), parts=[Sensed(MeanSensor())])
+    parts, settings = carts("stopping-point").replace(world=world), ech.Settings(1.0, DT)
+    found = ech.guarantee(parts, settings)
+    assert str(found.verdict) == "guaranteed" and str(found.kind) == "linearization"
+    slow = dataclasses.replace(world, parts=[Sensed(SlowSensor())])
+    found = ech.guarantee(parts.replace(world=slow), settings)
+    assert str(found.verdict) == "none" and "`SlowSensor` depends on time" in in_words(found)
+
+
+class DeadBand(SensorStage):
+    """Sees nothing near 0, and says that it is noise."""
+
+    random = True
+
+    def read(self, model, memory, x, clock, number):
+        return jnp.where(jnp.abs(x) < 0.3, 0.0, x), memory
+
+
+class Distrusted(ech.Network):
+    """A network that says it is another, which it is not."""
+
+    def prepared(self, *given):
+        medium = super().prepared(*given)
+        return JammedMedium(**vars(medium), silent=jnp.asarray(0), speaks=jnp.asarray(10**6))
+
+
+@pytest.mark.parametrize("network", [None, pytest.param("radio", marks=pytest.mark.slow)])
+def test_of_a_part_that_says_nothing_nothing_is_proved(network):
+    """What is dropped where agents rest, such as noise, is not dropped of a user's own."""
+    radio = network and ech.Network(rate=50.0)
+    world = ech.World(network=radio, parts=[Sensed(DeadBand())])
+    parts, settings = carts("stopping-point"), ech.Settings(1.0, DT)
+    assert (
+        str(ech.guarantee(parts.replace(world=ech.World(network=radio)), settings).kind) == "proof"
+    )
+    assert str(ech.guarantee(parts.replace(world=world), settings).verdict) == "none"
+
+
+def test_a_flight_refuses_what_its_vehicles_lack():
+    radio = ech.Network(rate=50.0)
+    for part, name in ((Sensed(SlowSensor()), "Sensed"), (Jammed(0, 9), "Jammed")):
+        world = ech.World(network=radio, parts=[part])
+        with pytest.raises(EchelonError, match=f"`{name}` is not in a flight; leave it out"):
+            flight_files(carts("stopping-point").replace(world=world), ech.Settings(1.0, DT), "")
+
+
+def test_a_part_of_your_own_is_no_subclass_of_echelons():
+    said = "`network` is a `Distrusted`, and must be a `Network` itself, not a subclass."
+    with pytest.raises(EchelonError) as caught:
+        flown(carts("stopping-point").replace(world=ech.World(network=Distrusted(rate=50.0))))
+    assert str(caught.value) == said
+
+
+# ---- events --------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Fading(ech.network.Event):
+    """Edges of an agent carry less for a while."""
+
+    at: float
+    agent: int
+    left: float = 0.25
+    end: float = 0.8
+
+    @property
+    def agents(self):
+        return (self.agent,)
+
+    def carried(self, graph, weights):
+        return np.where((graph.edges == self.agent).any(axis=1), self.left * weights, weights)
+
+
+@dataclasses.dataclass(frozen=True)
+class Known(Fading):
+    """The same, and it says that it is of a graph that switches."""
+
+    def uncovered(self, graph):
+        return ""
+
+
+FADED = [
+    (0.0, [(0, 1, 1.0), (1, 2, 1.0)]),
+    (0.4, [(0, 1, 1.0), (1, 2, 0.25)]),
+    (0.8, [(0, 1, 1.0), (1, 2, 1.0)]),
+]
+
+
+@pytest.mark.parametrize("engine", ["jax", "native"])
+def test_an_event_of_your_own_is_a_graph_that_switches(engine):
+    parts, settings = agreeing(), ech.Settings(STEPS * DT, DT, engine=engine)
+    turns = parts.replace(graph=ech.Graph.switching(FADED))
+    faded = parts.replace(events=[Fading(0.4, 2)])
+    ours, theirs = (ech.simulate(each, settings) for each in (faded, turns))
+    assert np.array_equal(ours.states, theirs.states) and ours.engine == engine
+    [event] = ech.summary(ours)["events"]
+    assert (event["what"], event["agents"], event["until"]) == ("fading", [2], 0.8)
+    assert (
+        event["guarantee"]["against"] == "`Fading` happens at 0.4 s, and no theorem is about that"
+    )
+
+
+def test_an_event_that_says_nothing_is_covered_by_no_guarantee():
+    parts, settings = agreeing(), ech.Settings(STEPS * DT, DT)
+    verdicts = [
+        ech.guarantee(parts.replace(**change), settings).verdict
+        for change in (
+            {"events": [Fading(0.4, 2)]},
+            {"events": [Known(0.4, 2)]},
+            {"graph": ech.Graph.switching(FADED)},
+        )
+    ]
+    assert [*map(str, verdicts)] == ["none", "guaranteed", "guaranteed"]
+    until = ech.guarantee(parts.replace(events=[Fading(0.4, 2)]), settings).prefix
+    assert until is not None and until.at == 0.4
+
+
+class Broken(Fading):
+    """Returns what are no weights."""
+
+    def carried(self, graph, weights):
+        return {1: -weights, 2: weights[:1]}[self.agent]
+
+
+@pytest.mark.parametrize(
+    "event, fault",
+    [
+        (Broken(0.4, 1), "its `carried` must return the weights of all edges"),
+        (Broken(0.4, 2), "its `carried` must return the weights of all edges"),
+        (Broken(0.4, 0), "its `carried` fails with"),
+        (Fading(0.9, 1), "times must be positive and finite"),
+        (Fading(0.4, 7), "agents are numbered from 0 to 2"),
+        (3, r"`events\[0\]` is a `int`, and must be a `Event`"),
+    ],
+)
+def test_what_is_no_event_is_refused(event, fault):
+    with pytest.raises(EchelonError, match=fault):
+        agreeing().replace(events=[event])

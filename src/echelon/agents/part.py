@@ -1,9 +1,11 @@
-"""What acts on agents and messages and no law knows: a part of the world says all about itself."""
+"""What no law knows: a part of the world, or an event of a run, says all about itself."""
 
+import math
 from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from echelon.agents.models.model import ControlAffine
+from echelon.core.types import Array
 
 
 class Effects(NamedTuple):
@@ -60,6 +62,10 @@ class WorldPart:
         """Return what theorems may bound of it."""
         return Effects()
 
+    def unflown(self) -> str:
+        """Return why `echelon fly` refuses it, and what to do; empty where agents fly with it."""
+        return "" if self.key else f"`{type(self).__name__}` is not in a flight; leave it out"
+
     def words(self, model: ControlAffine) -> str:
         """Return it in words, for data."""
         return str(self)
@@ -76,3 +82,40 @@ class WorldPart:
         own = {k: v for k, v in vars(self).items() if not k.startswith("_")}
         listed = ", ".join(f"{name} {value}" for name, value in own.items())
         return f"`{type(self).__name__}`" + f" ({listed})" * bool(listed)
+
+
+class Event:
+    """What happens to a formation at a time; all others ask an event about itself here.
+
+    One of your own is a frozen dataclass with the field `at`, s. From then to its `end` edges have
+    the weights of `carried`.
+    """
+
+    at: float
+    comes: ClassVar[bool | None] = None
+    """Whether its agent is there from then on, or is not; None where nobody comes or goes."""
+
+    @property
+    def agents(self) -> tuple[int, ...]:
+        """The agents that it is about."""
+        return ()
+
+    @property
+    def end(self) -> float:
+        """When it ends, s."""
+        return math.inf
+
+    def faults(self, graph: Any) -> Iterator[str]:
+        """Yield what does not fit the graph, which has no events yet."""
+        yield from ()
+
+    def carried(self, graph: Any, weights: Array) -> Array:
+        """Return the weights (E,) of edges while it lasts, from those without it."""
+        return weights
+
+    def uncovered(self, graph: Any) -> str:
+        """Return why no guarantee covers it; empty if one may, as of a graph that switches."""
+        return f"{self} at {self.at:g} s, and no theorem is about that"
+
+    def __str__(self) -> str:
+        return f"`{type(self).__name__}` happens"

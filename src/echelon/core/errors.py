@@ -119,8 +119,9 @@ def is_number(value: object) -> TypeGuard[float]:
 def check_kind(
     place: str, part: object, kind: type, fault: type[EchelonError] = SimulationError
 ) -> None:
-    """Raise `fault` unless a part is an instance of a class."""
-    if isinstance(part, kind):
+    """Raise `fault` unless a part is an instance of a class, and no subclass of a final one."""
+    if type(part) is kind or isinstance(part, kind) and not getattr(kind, "__final__", False):
         return
     got = f"the class `{part.__name__}`" if isinstance(part, type) else f"a `{type(part).__name__}`"
-    raise fault(f"`{place}` is {got}, and must be a `{kind.__name__}`.")
+    only = " itself, not a subclass" * isinstance(part, kind)
+    raise fault(f"`{place}` is {got}, and must be a `{kind.__name__}`{only}.")

@@ -7,10 +7,12 @@ from echelon.agents.network.formation import Formation
 from echelon.agents.network.formation_motion import OffsetMotion, Reshape, Rotate, Scale
 from echelon.agents.network.graph import Graph
 from echelon.agents.network.spectrum import Spectrum
+from echelon.agents.part import Event
 from echelon.core.gone import no_name
 
 __all__ = [
     "Cut",
+    "Event",
     "Formation",
     "Graph",
     "Join",

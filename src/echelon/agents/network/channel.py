@@ -156,6 +156,11 @@ class Network(WorldPart):
         """Return of what messages theorems are."""
         return "messages that arrive at once"
 
+    def unflown(self) -> str:
+        """Return that a flight has no outages."""
+        text = "`network.bursts` has no counterpart in a flight; use `network.loss`"
+        return text if self.bursts.share else ""
+
     def sentences(self, result: Any) -> str:
         """Return what a report says of it."""
         whole = self.messages is MessageContent.DEVIATION and self.prediction is Prediction.PREVIEW

@@ -7,20 +7,22 @@ import dataclasses
 import math
 import numbers
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple, TypeAlias, final
+from typing import NamedTuple, final
 
 import numpy as np
 
 from echelon.agents.network.edges import name_agents
 from echelon.agents.network.matrices import GraphMatrices, nearest_leaders, unreached
 from echelon.agents.network.switching import Schedule
+from echelon.agents.part import Event
 from echelon.core.errors import GraphError, is_number
+from echelon.core.trace import error_summary
 from echelon.core.types import Array
 
 
 @final
 @dataclasses.dataclass(frozen=True)
-class Lose:
+class Lose(Event):
     """An agent falls silent, and its body is gone.
 
     Args:
@@ -30,6 +32,21 @@ class Lose:
 
     agent: int
     at: float
+    comes = False
+
+    @property
+    def agents(self) -> tuple[int, ...]:
+        """The agent."""
+        return (self.agent,)
+
+    def uncovered(self, graph: GraphMatrices) -> str:
+        """Return that it leads; of others nothing is lost but their links."""
+        schedule = graph.schedule
+        assert schedule is not None and schedule.nearest is not None
+        before = max(schedule.row(self.at) - 1, 0)
+        if not (schedule.nearest[before] == self.agent).any():
+            return ""
+        return f"{self} at {self.at:g} s while it leads, and until a backup takes over nobody does"
 
     def __str__(self) -> str:
         return f"agent {self.agent} is lost"
@@ -37,7 +54,7 @@ class Lose:
 
 @final
 @dataclasses.dataclass(frozen=True)
-class Join:
+class Join(Event):
     """An agent joins in its initial state; before, it is neither heard nor anywhere.
 
     Args:
@@ -47,6 +64,16 @@ class Join:
 
     agent: int
     at: float
+    comes = True
+
+    @property
+    def agents(self) -> tuple[int, ...]:
+        """The agent."""
+        return (self.agent,)
+
+    def uncovered(self, graph: GraphMatrices) -> str:
+        """Return that it may be anywhere."""
+        return f"{self} at {self.at:g} s, and nothing bounds how far from its goal it is then"
 
     def __str__(self) -> str:
         return f"agent {self.agent} joins"
@@ -54,7 +81,7 @@ class Join:
 
 @final
 @dataclasses.dataclass(frozen=True)
-class Cut:
+class Cut(Event):
     """A link carries nothing, either way.
 
     Args:
@@ -68,22 +95,32 @@ class Cut:
     duration: float | None = None
 
     @property
+    def agents(self) -> tuple[int, ...]:
+        """The two agents."""
+        return tuple(self.link)
+
+    @property
     def end(self) -> float:
         """When the link is restored, s."""
         return math.inf if self.duration is None else self.at + self.duration
+
+    def faults(self, graph: GraphMatrices) -> Iterator[str]:
+        """Yield that there is no such link."""
+        if frozenset(self.link) not in {frozenset(edge) for edge in graph.edges.tolist()}:
+            yield "the graph has no such link"
+
+    def carried(self, graph: GraphMatrices, weights: Array) -> Array:
+        """Return the weights without the link."""
+        return np.where(np.isin(graph.edges, self.link).all(axis=1), 0.0, weights)
+
+    def uncovered(self, graph: GraphMatrices) -> str:
+        """Return nothing: it is of a graph that switches."""
+        return ""
 
     def __str__(self) -> str:
         i, j = self.link
         span = "for ever" if self.duration is None else f"for {self.duration:g} s"
         return f"the link between agents {i} and {j} is cut {span}"
-
-
-Event: TypeAlias = Lose | Join | Cut
-
-
-def agents_of(event: Event) -> tuple[int, ...]:
-    """Return the agents that an event is about."""
-    return tuple(event.link) if isinstance(event, Cut) else (event.agent,)
 
 
 def check_backups(graph: GraphMatrices, backups: Sequence[int]) -> None:
@@ -128,19 +165,31 @@ def event_faults(
 
 
 def _alone(graph: GraphMatrices, events: Sequence[Event], horizon: float) -> Iterator[EventFault]:
-    pairs = {frozenset(edge) for edge in graph.edges.tolist()}
     for k, event in enumerate(events):
-        span = event.duration if isinstance(event, Cut) else None
-        strange = [x for x in agents_of(event) if not _is_agent(x, graph.agents)]
-        if not (_is_time(event.at) and (span is None or _is_time(span))):
+        strange = [x for x in event.agents if not _is_agent(x, graph.agents)]
+        if not (_is_time(event.at) and event.at < event.end):
             yield EventFault(k, f"{event} at {event.at} s, and times must be positive and finite")
         elif event.at >= horizon:
             yield EventFault(k, f"{event} at {event.at:g} s, and the run ends at {horizon:g} s")
         elif strange:
             last = graph.agents - 1
             yield EventFault(k, f"{event}, and agents are numbered from 0 to {last}")
-        elif isinstance(event, Cut) and frozenset(event.link) not in pairs:
-            yield EventFault(k, f"{event}, and the graph has no such link")
+        else:
+            faults = (*event.faults(graph), *_misfits(event, graph))
+            yield from (EventFault(k, f"{event}, and {text}") for text in faults[:1])
+
+
+def _misfits(event: Event, graph: GraphMatrices) -> Iterator[str]:
+    """Yield that weights of edges are none."""
+    try:
+        weights = np.asarray(event.carried(graph, graph.weights.copy()), float)
+    # It is anyone's code, which may raise whatever it likes.
+    except Exception as error:
+        yield f"its `carried` fails with {error_summary(error)}"
+        return
+    shape = graph.weights.shape
+    if weights.shape != shape or not ((weights >= 0.0) & (weights < math.inf)).all():
+        yield "its `carried` must return the weights of all edges, finite and not negative"
 
 
 def _is_time(value: object) -> bool:
@@ -154,26 +203,27 @@ def _is_agent(value: object, agents: int) -> bool:
 def _in_order(
     graph: GraphMatrices, events: Sequence[Event], backups: Sequence[int]
 ) -> Iterator[EventFault]:
-    absent = {x for event in events for x in agents_of(event) if _joins_first(x, events)}
+    absent = {x for event in events for x in event.agents if _joins_first(x, events)}
     if graph.schedule is not None and graph.schedule.period is not None and events:
         yield EventFault(0, "a graph with a `period` takes no events")
         return
     for k in _by_time(events):
         event = events[k]
-        if isinstance(event, Cut):
+        if event.comes is None:
             continue
-        if isinstance(event, Lose) == (event.agent in absent):
-            already = "absent" if isinstance(event, Lose) else "present"
+        [agent] = event.agents
+        if event.comes != (agent in absent):
+            already = "present" if event.comes else "absent"
             yield EventFault(k, f"{event} at {event.at:g} s, when it is {already} already")
             return
-        leads = event.agent in graph.leaders
+        leads = agent in graph.leaders
         if leads and len(graph.leaders) > 1:
             yield EventFault(k, f"{event}, and one of several leaders cannot be lost, nor join")
             return
-        if leads and isinstance(event, Join) and _joins_first(event.agent, events):
+        if leads and event.comes and _joins_first(agent, events):
             yield EventFault(k, f"{event}, and nobody leads before")
             return
-        absent ^= {event.agent}
+        absent ^= {agent}
         if {*graph.leaders} <= absent and {*backups} <= absent:
             remedy = "keep one of them" if backups else "name `backups` in `leadership`"
             yield EventFault(k, f"{event}, and nobody leads afterwards; {remedy}")
@@ -185,8 +235,9 @@ def _by_time(events: Sequence[Event]) -> list[int]:
 
 
 def _joins_first(agent: int, events: Sequence[Event]) -> bool:
-    own = [events[k] for k in _by_time(events) if agents_of(events[k]) == (agent,)]
-    return bool(own) and isinstance(own[0], Join)
+    ordered = (events[k] for k in _by_time(events))
+    own = [event for event in ordered if event.comes is not None and agent in event.agents]
+    return bool(own) and own[0].comes is True
 
 
 def _cut_off(
@@ -215,15 +266,13 @@ def schedule_of(
 ) -> Schedule:
     """Return the schedule of links, presence and leaders; `absent` agents are so until the end."""
     base = graph.schedule or Schedule(np.zeros(1), graph.weights[None], None)
-    ends = [event.end for event in events if isinstance(event, Cut)]
-    times = [*base.starts.tolist(), *(event.at for event in events), *ends]
+    times = [*base.starts.tolist(), *(at for event in events for at in (event.at, event.end))]
     starts = np.unique([at for at in times if at < math.inf])
     weights = base.weights[[base.row(at) for at in starts.tolist()]].copy()
     for event in events:
-        if isinstance(event, Cut):
-            between = np.isin(graph.edges, event.link).all(axis=1)
-            weights[np.ix_((starts >= event.at) & (starts < event.end), between)] = 0.0
-    if all(isinstance(event, Cut) for event in events) and not absent:
+        for row in np.flatnonzero((starts >= event.at) & (starts < event.end)):
+            weights[row] = event.carried(graph, weights[row])
+    if all(event.comes is None for event in events) and not absent:
         return Schedule(starts, weights, None)
     present = _present(starts, graph.agents, events)
     present[:, list(absent)] = False
@@ -241,11 +290,11 @@ def _present(starts: Array, agents: int, events: Sequence[Event]) -> Array:
     present = np.ones((len(starts), agents), bool)
     for k in _by_time(events):
         event = events[k]
-        if isinstance(event, Cut):
+        if event.comes is None:
             continue
-        if _joins_first(event.agent, events[: k + 1]) and isinstance(event, Join):
-            present[starts < event.at, event.agent] = False
-        present[starts >= event.at, event.agent] = isinstance(event, Join)
+        if event.comes and _joins_first(event.agents[0], events[: k + 1]):
+            present[starts < event.at, event.agents] = False
+        present[starts >= event.at, event.agents] = event.comes
     return present
 
 

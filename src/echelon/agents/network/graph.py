@@ -23,7 +23,7 @@ from echelon.agents.network.edges import (
     pairs_within,
     split_weights,
 )
-from echelon.agents.network.events import Event, check_backups, event_faults, schedule_of
+from echelon.agents.network.events import check_backups, event_faults, schedule_of
 from echelon.agents.network.graph_file import FileEdges, number_nodes, read_graph
 from echelon.agents.network.matrices import (
     GraphMatrices,
@@ -41,7 +41,8 @@ from echelon.agents.network.spectrum import (
     symmetric_spectrum,
 )
 from echelon.agents.network.switching import Schedule, Stretch, unite
-from echelon.core.errors import GraphError
+from echelon.agents.part import Event
+from echelon.core.errors import GraphError, check_kind
 from echelon.core.types import Array, PathLike
 from echelon.core.words import amount
 
@@ -254,6 +255,8 @@ class Graph(GraphMatrices):
         before, events, backups = self.before, tuple(events), tuple(backups)
         if (events, backups) == (self.events, self.backups):
             return self
+        for k, event in enumerate(events):
+            check_kind(f"events[{k}]", event, Event, GraphError)
         check_backups(before, backups)
         for fault in event_faults(before, events, backups):
             raise GraphError(f"{fault.text}.")

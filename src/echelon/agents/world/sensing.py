@@ -206,6 +206,11 @@ class Sensing(WorldPart):
         """Return the delay, and whether it is estimated away."""
         return Effects(self.delay, estimated=self.estimator is not Estimation.NONE)
 
+    def unflown(self) -> str:
+        """Return that a flight has no late sensors."""
+        text = "`sensing.delay` has no counterpart in a flight; leave it out"
+        return text if self.delay else ""
+
     def sentences(self, result: Any) -> str:
         """Return what a report says of it."""
         return f"Sensing of own states: {self}."

@@ -14,7 +14,13 @@ from echelon.agents.part import Effects, WorldPart
 from echelon.agents.world.actuator import Actuator
 from echelon.agents.world.disturbance import Disturbance
 from echelon.agents.world.sensing import Sensing
-from echelon.core.errors import ModelError, SimulationError, did_you_mean, listing
+from echelon.core.errors import (
+    ModelError,
+    SimulationError,
+    check_kind,
+    did_you_mean,
+    listing,
+)
 
 
 def vary_parameters(
@@ -239,10 +245,8 @@ class World:
             raise SimulationError(f"`parts` is a `{kind}`, and must be a list of `WorldPart`.")
         named += [(f"parts[{k}]", part, WorldPart) for k, part in enumerate(self.parts)]
         for name, part, kind in named:
-            if part is not None and not isinstance(part, kind):
-                raise SimulationError(
-                    f"`{name}` is a `{type(part).__name__}`, and must be a `{kind.__name__}`."
-                )
+            if part is not None:
+                check_kind(name, part, kind)
         warnings = tuple[str, ...]()
         for plant in (self.plant, *self.plants.values()):
             if plant is not None:

@@ -7,9 +7,10 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from echelon.agents.network.events import Event, Join, Lose, agents_of
+from echelon.agents.network.events import Join, Lose
 from echelon.agents.network.formation_motion import Reshape
 from echelon.agents.network.graph import Graph
+from echelon.agents.part import Event
 from echelon.core.errors import SimulationError
 from echelon.core.types import Array, JsonObject
 from echelon.simulation.engine.parts import Parts
@@ -93,8 +94,8 @@ def happened(
         raise SimulationError(f"`{name}` got `{agent}`, and must be the number of an agent.")
     if graph.before.schedule is not None:
         raise SimulationError("agents of a graph that switches cannot be lost or join.")
-    own = [each for each in events if agents_of(each) == (agent,)]
-    if name == "join" and not (own and isinstance(own[-1], Lose)):
+    own = [each for each in events if each.agents == (agent,)]
+    if name == "join" and not (own and own[-1].comes is False):
         raise SimulationError(f"agent {agent} cannot join, since it is there.")
     after = (*events, KINDS[name](agent, at))
     graph.with_events(after, graph.backups)
@@ -103,7 +104,7 @@ def happened(
 
 def as_entries(events: Sequence[Event]) -> list[JsonObject]:
     """Return losses and arrivals as a scenario states them."""
-    pairs = ((each, agents_of(each)[0]) for each in events)
+    pairs = ((each, each.agents[0]) for each in events)
     return [{"at": each.at, type(each).__name__.lower(): agent} for each, agent in pairs]
 
 
@@ -117,6 +118,9 @@ def moments_of(events: Sequence[Event], changes: Sequence[JsonObject]) -> list[t
 def as_changes(entries: Sequence[JsonObject]) -> list[JsonObject]:
     """Return the section `events` of a scenario as changes of a live loop."""
     changes, named = list[JsonObject](), set[int]()
+    own = next((entry["python"] for entry in entries if "python" in entry), None)
+    if own is not None:
+        raise SimulationError(f"the event `{own}` cannot happen live; use `echelon run`.")
     for entry in sorted(entries, key=lambda entry: entry["at"]):
         agents = {entry[name] for name in KINDS if name in entry}
         if "join" in entry and not agents <= named:

@@ -10,10 +10,10 @@ from jaxtyping import Float
 
 from echelon.agents.models.linearization import linearize
 from echelon.agents.network.channel import Network
-from echelon.agents.network.events import Event
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.formation_motion import FormationMotion
 from echelon.agents.network.graph import Graph
+from echelon.agents.part import Event
 from echelon.apps.live.attendance import RESHAPE
 from echelon.core.errors import EchelonError
 from echelon.core.numerics import precision

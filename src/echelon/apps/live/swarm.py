@@ -306,6 +306,9 @@ class LiveLoop:
         network, settings = self.panel.network(knobs), self.settings
         if network is not None:
             channel = network.prepared(settings.dt, math.inf, settings.seed)
+            # A medium of a user's own remains one.
+            medium: Any = getattr(loop.network, "medium", channel)
+            channel = dataclasses.replace(medium, **vars(channel))
             loop = loop.with_medium(self._roomy(channel))
         stages = tuple(
             dataclasses.replace(stage, std=knobs.noise * first.std)

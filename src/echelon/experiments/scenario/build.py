@@ -12,11 +12,11 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
 from echelon.agents.models.unlike import UnlikeAgents
 from echelon.agents.network.channel import Bursts, Network
-from echelon.agents.network.events import Cut, Event, Join, Lose, check_backups, event_faults
+from echelon.agents.network.events import Cut, Join, Lose, check_backups, event_faults
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.formation_motion import OffsetMotion, Reshape, Rotate, Scale
 from echelon.agents.network.graph import Graph
-from echelon.agents.part import WorldPart
+from echelon.agents.part import Event, WorldPart
 from echelon.agents.references.reference import LeaderPath, Reference, check_reference
 from echelon.agents.references.slowed_path import slowed
 from echelon.agents.world.actuator import Actuator
@@ -537,13 +537,25 @@ class _Builder:
         return leadership
 
     def _events(self, leadership: Leadership | None) -> list[Event]:
-        events = [_event(spec) for spec in self.scenario.events]
+        specs = enumerate(self.scenario.events)
+        events = [self.part(lambda spec=spec: self._event(spec), "events", k) for k, spec in specs]
+        self.settle()
         backups = () if leadership is None else leadership.backups
         for k, text in event_faults(self.graph, events, backups, self.scenario.simulation.horizon):
             with self.at("events", k):
                 raise ScenarioError(f"{text}.")
         self.settle()
         return events
+
+    def _event(self, spec: EventSpec) -> Event:
+        if spec.cut is not None:
+            return Cut(spec.cut, spec.at, spec.duration)
+        if spec.join is not None:
+            return Join(spec.join, spec.at)
+        if spec.lose is not None:
+            return Lose(spec.lose, spec.at)
+        own = {"at": spec.at, **spec.parameters}
+        return self._class(Event, {}, None, spec.python, own).create()
 
 
 def _graph(spec: GraphSpec, folder: Path) -> Graph:
@@ -569,15 +581,6 @@ def _check_span(reference: LeaderPath, horizon: float) -> None:
         f"the path {when}, and the run is from 0 to {horizon:g} s; for a path from a file give "
         "`begin: 0`, or the unit of its times, as in `t [ms]`."
     )
-
-
-def _event(spec: EventSpec) -> Event:
-    if spec.cut is not None:
-        return Cut(spec.cut, spec.at, spec.duration)
-    if spec.join is not None:
-        return Join(spec.join, spec.at)
-    assert spec.lose is not None, "the schema holds that there is one of three"
-    return Lose(spec.lose, spec.at)
 
 
 def _named_set(part: NamedClass, name: object, changes: Mapping[str, object]) -> ControlAffine:

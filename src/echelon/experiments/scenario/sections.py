@@ -650,10 +650,10 @@ _Link = Annotated[Annotated[tuple[Agent, Agent], Field(strict=False)] | None, Un
 
 
 @final
-class EventSpec(Section, **either("lose", "cut", "join")):
+class EventSpec(Section, **either("lose", "cut", "join", "python")):
     """What happens to the formation at a time; no law and no gain is made for it."""
 
-    one_of: ClassVar = ("lose", "cut", "join")
+    one_of: ClassVar = ("lose", "cut", "join", "python")
     at: Annotated[Positive, Unit("s")]
     """Time, s; below the horizon."""
     lose: Agent | None = None
@@ -665,6 +665,10 @@ class EventSpec(Section, **either("lose", "cut", "join")):
     join: Agent | None = None
     """The number of an agent that joins, in its initial state; before, or since it was lost, it is
     absent."""
+    python: Annotated[ClassInFile | None, TakenBy("python")] = None
+    """`file.py:Class`, an `Event` of yours, the file relative to the scenario file."""
+    parameters: Annotated[dict[str, Numeric], TakenBy("python")] = {}
+    """Parameters of that class, besides `at`."""
 
 
 @final

@@ -24,7 +24,7 @@ from echelon.agents.references.reference import LeaderPath
 from echelon.core.compiled import cached_jit, compiled_for_one_call
 from echelon.core.numerics import Field
 from echelon.core.types import Array, Input, PyTree, Scalar, State
-from echelon.laws.law import Expected, Feeds, Law, LocalView, Memory, Speaks, Travels, reference_of
+from echelon.laws.law import Expected, Law, LocalView, Memory, Speaks, Travels, reference_of
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import Prepared
@@ -32,8 +32,10 @@ from echelon.simulation.step.assembly import assemble
 from echelon.simulation.step.drive import Problem
 from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.motion import IdealMotors, LaggingMotors, PlantStep
+from echelon.simulation.step.own_members import own_classes
 from echelon.simulation.step.records import LoopState
 from echelon.simulation.step.roster import Everybody, Links, SwitchingLinks
+from echelon.simulation.step.run_laws import feedforward_of
 from echelon.simulation.step.sequence import begin, step
 
 # ---- leaders at rest -----------------------------------------------------------------------------
@@ -83,13 +85,13 @@ class RestingLeader(Law, Travels, Speaks):
         period: Scalar | float,
     ) -> Expected:
         """Return what it says at its trim, with the deviation."""
-        x = _trim_at(model, t, self.travel)
-        memory, silence = self.begin(model, x), jnp.zeros(len(model.input_names))
-        there = deviation + self._said(model, x, jnp.zeros_like(x), memory)
+        x, still = _trim_at(model, t, self.travel), jnp.zeros(len(model.input_names))
+        memory = self.begin(model, x)
+        said = self._said(model, x, jnp.zeros_like(x), memory)
         if not Speaks.may(self.follower, "signal"):
-            return Expected(there)
-        # No law acts on a signal as on a state: at its trim a leader sends what it began with.
-        return Expected(there, Feeds.of(self.follower).message(model, x, silence, memory))
+            return Expected(deviation + said)
+        # A signal is no state, from which its law could act.
+        return Expected(deviation + said, feedforward_of(self.follower, model, x, still, memory))
 
     def _said(self, model: ControlAffine, x: State, offset: State, memory: Memory) -> jax.Array:
         said = self.signal(model, x, offset, memory)
@@ -236,7 +238,7 @@ def _flow(X: jax.Array) -> jax.Array:
 def held_exactly(loop: Loop) -> Loop | None:
     """Return the loop whose plants move by the exact flow; None where they have another step."""
     motion = loop.motion
-    if type(motion) is not PlantStep or motion.integrator == "printed":
+    if motion.integrator == "printed" or any(own_classes(motion)):
         return None
     rows = motion.rows if motion.rows == () else (motion.rows[0], HeldExactly(motion.rows[1]))
     return loop.replace(

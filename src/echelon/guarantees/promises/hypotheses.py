@@ -4,6 +4,7 @@ A failed line with a `reason` rules out any guarantee; without one it weakens or
 """
 
 import dataclasses
+import math
 from collections.abc import Iterator
 
 import jax
@@ -14,8 +15,8 @@ from echelon.agents.models.linearization import at_trim
 from echelon.agents.models.model import ControlAffine, position_unit
 from echelon.agents.models.model_check import Shortfall, at_limits, is_limited, trim_shortfall
 from echelon.agents.models.relative_equilibrium import trim_speed, trim_velocity
-from echelon.agents.network.events import Cut, Event, Join, agents_of
 from echelon.agents.network.graph import Graph
+from echelon.agents.part import Event
 from echelon.agents.world.actuator import Actuator
 from echelon.core.compiled import compiled_for_one_call
 from echelon.core.digits import about, at_least
@@ -294,31 +295,14 @@ def events_line(parts: Parts) -> Iterator[Statement]:
     if not graph.events:
         return
     for event in graph.events:
-        text = uncovered(graph, event)
+        text = event.uncovered(graph)
         if text:
             shown = f"{event.at:g} s"
             yield fails(name, Kind.PROOF, text, event.at, shown, remedy=_WITHOUT_EVENT, reason=text)
             return
-    text = "a cut link, and an agent that nobody hears any more, are those of a graph that switches"
+    text = "links that change, and an agent that nobody hears any more, are those of a graph that "
+    text += "switches"
     yield holds(name, Kind.PROOF, text, len(graph.events), f"{len(graph.events)} covered")
-
-
-def uncovered(graph: Graph, event: Event) -> str:
-    """Return why no guarantee covers an event; empty if one may."""
-    if isinstance(event, Join):
-        return f"{event} at {event.at:g} s, and nothing bounds how far from its goal it is then"
-    if not isinstance(event, Cut) and _leads(graph, event):
-        return (
-            f"{event} at {event.at:g} s while it leads, and until a backup takes over nobody does"
-        )
-    return ""
-
-
-def _leads(graph: Graph, event: Event) -> bool:
-    schedule = graph.schedule
-    assert schedule is not None and schedule.nearest is not None
-    row = schedule.row(event.at)
-    return bool((schedule.nearest[max(row - 1, 0)] == agents_of(event)[0]).any())
 
 
 def events_in_words(parts: Parts, guarantee: Guarantee) -> list[JsonObject]:
@@ -336,22 +320,22 @@ def as_mapping(event: Event) -> JsonObject:
     return {
         "at": event.at,
         "what": type(event).__name__.lower(),
-        "agents": list(agents_of(event)),
-        "until": event.end if isinstance(event, Cut) and event.duration is not None else None,
+        "agents": list(event.agents),
+        "until": event.end if math.isfinite(event.end) else None,
         "text": str(event),
     }
 
 
 def _through(graph: Graph, event: Event, guarantee: Guarantee) -> JsonObject:
     """Return whether a guarantee covers an event, and why not."""
-    why = uncovered(graph, event)
+    why = event.uncovered(graph)
     verdict = GuaranteeVerdict.NONE if why else guarantee.verdict
     if guarantee.ignores and verdict is GuaranteeVerdict.GUARANTEED:
         # It is of another flight, and covers nothing of this one.
         verdict = GuaranteeVerdict.NONE
     return {
         "verdict": str(verdict),
-        "of": "all" if isinstance(event, Cut) else "others",
+        "of": "all" if event.comes is None else "others",
         "kind": str(guarantee.kind) if verdict is GuaranteeVerdict.GUARANTEED else None,
         "against": why,
         "conditions": list(guarantee.conditions) if not why else [],

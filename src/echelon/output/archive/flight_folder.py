@@ -251,10 +251,8 @@ def _network(parts: Parts) -> Network:
         )
     if parts.graph.schedule is not None:
         raise FlightError("the graph of the scenario switches, which no flight does yet.")
-    if network.bursts.share:
-        raise FlightError("`network.bursts` has no counterpart in a flight; use `network.loss`.")
-    if parts.world.sensing is not None and parts.world.sensing.delay:
-        raise FlightError("`sensing.delay` has no counterpart in a flight; leave it out.")
+    for text in filter(None, (part.unflown() for part in parts.world.all_parts)):
+        raise FlightError(f"{text}.")
     return network
 
 

@@ -15,10 +15,10 @@ from numpy.typing import ArrayLike
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.unlike import UnlikeAgents
-from echelon.agents.network.events import Event
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.agents.network.hearing import heard_along
+from echelon.agents.part import Event
 from echelon.agents.world.world import World
 from echelon.core.errors import SimulationError, check_kind
 from echelon.core.types import Array

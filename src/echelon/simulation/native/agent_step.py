@@ -52,8 +52,7 @@ from echelon.simulation.step.records import (
     Steps,
     choose,
 )
-from echelon.simulation.step.roster import Everybody, JoiningAgents, Links
-from echelon.simulation.step.run_laws import has_angles
+from echelon.simulation.step.roster import Everybody, Links
 from echelon.simulation.step.sequence import act, begin, hear, held, saying
 from echelon.simulation.step.turns import by_depth
 
@@ -75,11 +74,9 @@ def check_loop(loop: Loop) -> None:
 
 
 def check_distances(loop: Loop) -> None:
-    """Raise `Unsupported` if agents need others' hulls, headings, or who leads in the same step."""
-    joins = isinstance(loop.roster, JoiningAgents) and has_angles(loop.laws.follower)
+    """Raise `Unsupported` if agents need others' hulls, or who leads in the same step."""
     for fault, text in (
         (loop.surroundings.keeps_apart, "agents that keep away from each other"),
-        (joins, "agents that join and take over how often others turned"),
         (loop.laws.backups and not loop.network.late, "backup leaders in the ideal network"),
     ):
         if fault:

@@ -35,6 +35,7 @@ from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.meter import ALWAYS, Sums
 from echelon.simulation.step.records import ComponentMemory, LawMemories, LoopState
 from echelon.simulation.step.roster import ActiveAgents
+from echelon.simulation.step.run_laws import has_angles
 from echelon.simulation.step.sequence import begin, said_by
 
 _AGENT_STEPS, _FEWEST = 2_000_000, 4
@@ -354,7 +355,21 @@ class NativeStepper(Stepper):
             x, memory, cut = self._read_moment()
             self._renew(step, x)
             memory[new], cut[new] = self._begun()[new], 0.0
-            self._load(self._whole(step, x, memory, cut))
+            now = self._whole(step, x, memory, cut)
+            angles = has_angles(self.loop.laws.follower)
+            self._load(self._beside_others(now, new) if angles else now)
+
+    def _beside_others(self, now: LoopState, new: Array) -> LoopState:
+        """Return a moment with the headings of those who begin beside those of the others."""
+        laws = list[LawMemories]()
+        for k, (loop, begins) in enumerate(zip(self.loops, np.split(new, len(self.loops)))):
+            mine = of_formation(self.loops, now, k)
+            there = np.asarray(loop.roster.here(mine.step)) & ~begins
+            other = said_by(loop, mine)[int(there.argmax())]
+            own = mine.memory.laws, jnp.asarray(begins & there.any()), other
+            laws.append(loop.laws.beside(*own))
+        joined = jax.tree.map(lambda *parts: np.concatenate(parts), *laws)
+        return now._replace(memory=now.memory._replace(laws=joined))
 
     def _call(self, step: int, steps: int, input_step: int, table: Array | None) -> None:
         """Run the kernel; each step exchanges the two mirrors."""
@@ -578,22 +593,19 @@ def mirror_values(
     relative = x - offsets
     if not with_signals:
         return relative
-    counts = [
-        len(loops[0].places.offsets),
-        len(loops[0].laws.leaders),
-        len(loops[0].laws.followers),
-    ]
-    sent = list[Array]()
-    for k, loop in enumerate(loops):
-        all_, leaders, others = (slice(k * count, (k + 1) * count) for count in counts)
-        pairs = zip((leaders, others), now.memory.laws, strict=True)
-        laws = LawMemories(
-            *(jax.tree.map(lambda x, some=some: x[some], own) for some, own in pairs)
-        )
-        memory = now.memory._replace(laws=laws)
-        mine = now._replace(states=now.states[all_], memory=memory)
-        sent.append(np.asarray(said_by(loop, jax.tree.map(jnp.asarray, mine))))
-    return np.concatenate([relative, np.concatenate(sent)], axis=1)
+    each = (said_by(loop, of_formation(loops, now, k)) for k, loop in enumerate(loops))
+    return np.concatenate([relative, np.concatenate([*map(np.asarray, each)])], axis=1)
+
+
+def of_formation(loops: Sequence[Loop], now: LoopState, k: int) -> LoopState:
+    """Return the states of one of some formations, and what its laws remember."""
+    laws = loops[0].laws
+    counts = len(loops[0].places.offsets), len(laws.leaders), len(laws.followers)
+    all_, *groups = (slice(k * count, (k + 1) * count) for count in counts)
+    pairs = zip(groups, now.memory.laws, strict=True)
+    own = (jax.tree.map(lambda x, some=some: x[some], each) for some, each in pairs)
+    mine = now._replace(states=now.states[all_], memory=now.memory._replace(laws=LawMemories(*own)))
+    return jax.tree.map(jnp.asarray, mine)
 
 
 @cached_jit

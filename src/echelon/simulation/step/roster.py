@@ -113,7 +113,7 @@ class Everybody(eqx.Module):
         return now
 
     def restarting(self, step: int) -> Array | None:
-        """Return which agents (N,) begin anew at a step, for the host; None where none ever do."""
+        """Return which agents (N,) begin at a step, for the host; None where none ever do."""
         return None
 
     def measured(self, meter: RunStatistics, step: jax.Array) -> RunStatistics:
@@ -162,6 +162,11 @@ class ActiveAgents(Everybody):
 class JoiningAgents(ActiveAgents):
     """The same, with headings that grow with every turn: who joins takes over others' turns."""
 
+    def restarting(self, step: int) -> Array | None:
+        """Return which agents (N,) begin at a step, for the host."""
+        now, before = (self.rows[self.switches.stretch(k)[0]] for k in (step, max(step - 1, 0)))
+        return now & ~before
+
     def _begun(self, new: jax.Array, now: LoopState, anew: Anew) -> LoopState:
         return now
 
@@ -183,11 +188,6 @@ class ReturningAgents(JoiningAgents):
     def begin(self, states: States | Array) -> PyTree:
         """Return the start."""
         return states
-
-    def restarting(self, step: int) -> Array | None:
-        """Return which agents (N,) begin anew at a step, for the host."""
-        now, before = (self.rows[self.switches.stretch(k)[0]] for k in (step, max(step - 1, 0)))
-        return now & ~before
 
     def _begun(self, new: jax.Array, now: LoopState, anew: Anew) -> LoopState:
         return anew(new, now.memory.roster)
