@@ -8,12 +8,11 @@ import numpy as np
 from runs import made_up
 
 import echelon as ech
-from echelon.apps.cli import tables
 from echelon.core.statement import Hypothesis, Topic
 from echelon.core.words import Feedforward, Kind, Theorem, Verdict
 from echelon.experiments.scenario.scenario import json_schema
 from echelon.experiments.studies.compare import Comparison
-from echelon.output.reports import comparison_report, run_report
+from echelon.output.reports import comparison_report, design_report, run_report
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 TEXT = (DOCS / "glossary.md").read_text("utf-8")
@@ -41,7 +40,9 @@ def test_every_word_of_a_check_is_explained():
 
 def test_every_column_of_a_design_is_explained():
     names = {
-        re.sub(r"(,.*| \(\d\))", "", " ".join(x.split())) for x, _ in tables._DESIGN.values() if x
+        re.sub(r"(,.*| \(\d\))", "", " ".join(x.split()))
+        for x, _ in design_report._DESIGN.values()
+        if x
     }
     assert names <= set(ENTRIES), names - set(ENTRIES)
 

@@ -146,17 +146,11 @@ class FlatLaw(Law, Speaks, Feeds, KeepsApart, Checks):
                 roots or speeds are not as many as it needs.
         """
         kinds = [(part, _checked_chains(part)) for part in groups_of(model)]
-        longest = max(kinds, key=lambda pair: max(pair[1].degrees))
-        needed = max(longest[1].degrees) - 1
-        if self.roots is not None and len(self.roots) != needed:
-            raise LawError(
-                f"`roots` are {list(self.roots)}, and `{type(longest[0]).__name__}` needs "
-                f"{needed}: its longest chain is of {needed + 1} integrators."
-            )
-        roots = self.roots_for(needed)
+        roots = self._roots_of(kinds)
+        lengths = [max(chains.degrees) - 1 for _, chains in kinds]
         loops = [
-            FlatLoop.of(part, chains, roots[: max(chains.degrees) - 1], self.observer)
-            for part, chains in kinds
+            FlatLoop.of(part, chains, roots[:length], self.observer)
+            for (part, chains), length in zip(kinds, lengths, strict=True)
         ]
         loop = loops[0]
         if isinstance(model, UnlikeAgents):
@@ -170,6 +164,17 @@ class FlatLaw(Law, Speaks, Feeds, KeepsApart, Checks):
                 f"{listing(outputs)}."
             )
         return loop
+
+    def _roots_of(self, kinds: Sequence[tuple[ControlAffine, Chains]]) -> tuple[float, ...]:
+        """Return as many roots as the longest chain of some models needs."""
+        model, chains = max(kinds, key=lambda pair: max(pair[1].degrees))
+        needed = max(chains.degrees) - 1
+        if self.roots is not None and len(self.roots) != needed:
+            raise LawError(
+                f"`roots` are {list(self.roots)}, and `{type(model).__name__}` needs {needed}: its "
+                f"longest chain is of {needed + 1} integrators."
+            )
+        return self.roots_for(needed)
 
     def speeds_within(
         self,
@@ -187,19 +192,21 @@ class FlatLaw(Law, Speaks, Feeds, KeepsApart, Checks):
         if self.speed is not None:
             return self.speed
         link = most if links == 1 else min(most, max(most / links, _CHAINED))
-        each = list[dict[str, float]]()
+
+        cap, each = most if links == 1 else math.inf, list[dict[str, float]]()
         for part, own in zip(groups_of(model), loops_of(loop), strict=True):
-            chains, speeds = own.chains, dict.fromkeys(own.chains.outputs, link)
+            each.append(dict.fromkeys(own.chains.outputs, link))
             for bound in part.flat_bounds or ():
-                degree = chains.degrees[chains.outputs.index(bound.outputs[0])]
-                left = _left(self.roots_for(degree - 1), bound, slowest(bound))
-                cap = most if links == 1 else math.inf
+                left = self._left(own.chains, bound, slowest(bound))
                 bounded = min(cap, share * left) / links if left > 0.0 else link
-                speeds |= dict.fromkeys(bound.outputs, bounded)
-            each.append(speeds)
+                each[-1] |= dict.fromkeys(bound.outputs, bounded)
         # All groups agree on a place, so that the slowest sets the speed.
         names = loop.chains.outputs
         return tuple(min(x[name] for x in each if name in x) for name in names)
+
+    def _left(self, chains: Chains, bound: FlatBound, slowest: float) -> float:
+        degree = chains.degrees[chains.outputs.index(bound.outputs[0])]
+        return _left(self.roots_for(degree - 1), bound, slowest)
 
     def bounded(self, x: jax.Array) -> jax.Array:
         """Return sigma(x) = x / sqrt(1 + (x/s)^2): odd, increasing, of slope 1 at 0, below s."""

@@ -17,6 +17,7 @@ import numpy as np
 from echelon.agents.models.chains import Chains, initial_integrators
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.unlike import UnlikeAgents
+from echelon.agents.network.formation_motion import OwnOffset
 from echelon.core.errors import LawError
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.laws.flat_loop import FlatLoop, FlatMemory, Observer, beside_turns, chain_weights
@@ -246,24 +247,34 @@ class UnlikeLoop(eqx.Module):
         offset_rate: State | None = None,
     ) -> tuple[Input, FlatMemory]:
         """Return the physical input that makes zeta move at a rate (m,), and the next memory."""
-        assert isinstance(model, UnlikeAgents) and memory.carried is not None
-        inputs, each, stages = list[Input](), list[FlatMemory](), list[jax.Array]()
-        none = jnp.zeros(len(model.input_names), view.x.dtype)
-        for k in self.present:
-            loop = self.loops[k]
-            offset = view.offset[model.states_of(k)]
-            own = eqx.tree_at(lambda v: (v.x, v.offset), view, (model.part(k, view.x), offset))
-            mine = self._memory_of(model, k, memory)
-            passed, after = self._filtered(k, rate, memory.carried[1:], view.period)
-            u, mine = loop.obey(model.models[k], own, passed[self.outputs_of(k)], mine)
-            held = (memory.carried[0] + view.period * rate).at[self.outputs_of(k)].set(0.0)
-            stages.append(jnp.concatenate([held[None], after]))
-            inputs.append(none.at[model.inputs_of(k)].set(u))
-            each.append(mine)
+        assert isinstance(model, UnlikeAgents)
+        rows = [self._obeyed(k, model, view, rate, memory) for k in self.present]
+        inputs, each, stages = zip(*rows, strict=True)
         place = self.place(model, view.x, view.offset, memory)
         carried = model.chosen(view.x, stages, self.present)
         memory = self.beside(memory._replace(rate=rate, carried=carried), place)
         return model.chosen(view.x, inputs, self.present), self._with(model, view.x, each, memory)
+
+    def _obeyed(
+        self, kind: int, model: UnlikeAgents, view: LocalView, rate: jax.Array, memory: FlatMemory
+    ) -> tuple[Input, FlatMemory, jax.Array]:
+        """Return the input of an agent of a group, its memory, and what it carries."""
+        assert memory.carried is not None
+        at, inputs = self.outputs_of(kind), jnp.zeros(len(model.input_names), view.x.dtype)
+        known = model.part(kind, view.x), view.offset[model.states_of(kind)]
+        own = eqx.tree_at(lambda v: (v.x, v.offset), view, known)
+        passed, after = self._filtered(kind, rate, memory.carried[1:], view.period)
+        mine = self._memory_of(model, kind, memory)
+        u, mine = self.loops[kind].obey(model.models[kind], own, passed[at], mine)
+        held = (memory.carried[0] + view.period * rate).at[at].set(0.0)
+        carried = jnp.concatenate([held[None], after])
+        return inputs.at[model.inputs_of(kind)].set(u), mine, carried
+
+    def stopping_offset(
+        self, model: ControlAffine, own: OwnOffset, t: Scalar
+    ) -> tuple[State, State]:
+        """Refuse offsets that move."""
+        raise LawError("a formation that moves is of agents of one model, and these are unlike.")
 
     def settle(
         self,
