@@ -57,20 +57,27 @@ def _repeats(parts: Parts, local: LocalCertificate) -> Statement:
     return holds(name, Kind.PROOF, text, local.period, amount(local.period, "step"))
 
 
+_RESTLESS = {
+    Fault.SINGULAR: (
+        "agents at rest at their goals have no finite input or message in the steps that run",
+        "use models and laws with finite inputs at rest",
+    ),
+    Fault.NO_REST: (
+        "agents at their goals do not stay there, and no place was found where they rest",
+        "let the law return the trim input where nothing disagrees",
+    ),
+}
+
+
 def _rests(parts: Parts, local: LocalCertificate) -> Statement:
     name = Hypothesis.REST
     if Fault.PLACES in local.faults:
         text = f"the step depends on where agents are: shifted as the trim moves, {local.culprit}"
         remedy = "let laws use differences of positions alone"
         return fails(name, _LINEAR, text, remedy=remedy, reason=text)
-    if Fault.SINGULAR in local.faults:
-        text = "agents at rest at their goals have no finite input or message in the steps that run"
-        remedy = "use models and laws with finite inputs at rest"
-        return fails(name, _LINEAR, text, remedy=remedy, reason=text)
-    if Fault.NO_REST in local.faults:
-        text = "agents at their goals do not stay there, and no place was found where they rest"
-        remedy = "let the law return the trim input where nothing disagrees"
-        return fails(name, _LINEAR, text, remedy=remedy, reason=text)
+    for fault, (text, remedy) in _RESTLESS.items():
+        if fault in local.faults:
+            return fails(name, _LINEAR, text, remedy=remedy, reason=text)
     if Fault.OFF_GOALS in local.faults:
         text = f"agents rest {at_least(local.off)} off their goals in `{local.culprit}`"
         remedy = "let laws know the plant, or apply the trim input"
