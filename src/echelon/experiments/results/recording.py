@@ -282,10 +282,16 @@ def read_recording(file: Path) -> tuple[Recording, Labelled]:
         ) from error
 
 
+def is_unlike(run: Recording) -> bool:
+    """Tell whether a run is of groups of unlike agents."""
+    return bool(run.attributes.get("groups"))
+
+
 def group_name(run: Recording, agent: int) -> str:
     """Return the name of an agent's group, which its last state says; empty where all are alike."""
-    names = str(run.attributes.get("groups", "")).split("; ")
-    return names[round(run.states[0, agent, -1])] if names[0] else ""
+    if not is_unlike(run):
+        return ""
+    return str(run.attributes["groups"]).split("; ")[round(run.states[0, agent, -1])]
 
 
 def recording(arrays: Mapping[str, np.ndarray], attributes: JsonObject) -> Recording:

@@ -11,7 +11,7 @@ import numpy as np
 from echelon.core.claim import number_in
 from echelon.core.errors import OutputError
 from echelon.core.types import Array, JsonObject
-from echelon.experiments.results.recording import Recording
+from echelon.experiments.results.recording import Recording, group_name, is_unlike
 from echelon.output.plots.space import Space, body_width, clipped_places, space_of
 from echelon.output.plots.style import raised
 from echelon.output.reports.guarantee_text import guarantee_text, short_form
@@ -171,6 +171,7 @@ def header(run: Recording, space: Space) -> JsonObject:
         "promise": _badge_of_run(run),
         "agents": run.agents,
         "leaders": list(run.leaders),
+        "groups": [group_name(run, k) for k in range(run.agents)] if is_unlike(run) else None,
         "nearest": run.nearest.tolist(),
         "edges": run.edges.tolist(),
         "heard": heard_by(run.heard),
