@@ -1,5 +1,8 @@
 """Agents of different models in one formation, under the law `stopping-point`."""
 
+import math
+
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -137,6 +140,62 @@ def test_errors_decay_as_the_certificate_of_unlike_agents_says():
     assert np.log(first / last) / 2.0 == pytest.approx(rate, rel=0.05)
 
 
+class Ahead(ech.ControlAffine):
+    """A single integrator that is seen 0.1 m ahead of where it is."""
+
+    state_names = output_names = position = flat_outputs = ("x", "y")
+    state_units, input_names, input_units = ("m", "m"), ("vx", "vy"), ("m/s", "m/s")
+    state_groups = {"position": ("x", "y")}  # noqa: RUF012
+    flat_order = 1
+
+    def drift(self, x):
+        return 0.0 * x
+
+    def input_map(self, x):
+        return jnp.eye(2, dtype=x.dtype)
+
+    def output(self, x):
+        return x + jnp.array([0.1, 0.0], x.dtype)
+
+
+def verdict_of(parts, **settings):
+    promise = ech.guarantee(parts, ech.Settings(horizon=1.0, dt=DT, **settings))
+    return str(promise.verdict)
+
+
+def test_a_leader_whose_output_is_elsewhere_is_seen_there():
+    parts = unlike(("ahead", 1, Ahead()), ("cart", 1, integrators(2)), offsets={1: (1.0, 0.5)})
+    assert verdict_of(parts) == "none"
+    assert run(parts, 8.0).states[-1][1, 0] == pytest.approx(1.1)
+
+
+def test_a_leader_that_diverges_by_its_own_law_is_not_guaranteed():
+    leader = ech.laws.StoppingLeader(coupling=1000.0, speed=math.inf)
+    groups = ("walker", 1, integrators(1)), ("cart", 1, integrators(2))
+    rest = {"start_error": {"x": 0.005}, "offsets": {1: (1.0, 0.5)}}
+    parts = unlike(*groups, leader=leader, **rest)
+    assert verdict_of(parts) == "none"
+    assert np.abs(run(parts, 2.0).states[-1]).max() > 1e3
+    assert verdict_of(unlike(*groups, **rest)) == "guaranteed"
+
+
+def test_several_leaders_of_a_group_that_no_follower_has():
+    graph = ech.Graph.from_edges([(0, 1), (1, 2)], leaders=(0, 1))
+    groups = ("walker", 2, integrators(1)), ("cart", 1, integrators(2))
+    parts = unlike(*groups, offsets={1: (1.0, 0.5), 2: (-1.0, 0.2)}, graph=graph)
+    assert verdict_of(parts) == "guaranteed"
+
+
+def test_wind_moves_nothing_that_an_agent_does_not_have():
+    parts = unlike(*CARTS, world=ech.World(disturbance=ech.Disturbance(constant={"vx": 1.0})))
+    states = run(parts, 1.0).states
+    assert (states[:, [0, 3], 2:4] == 0.0).all() and (states[..., -1] == [0, 1, 1, 2]).all()
+    for change in ({"constant": {"kind": 1.0}}, {"rms": {"kind": 1.0}}):
+        pushed = parts.replace(world=ech.World(disturbance=ech.Disturbance(**change)))
+        with pytest.raises(EchelonError, match="of which group"):
+            run(pushed, 0.1)
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -147,13 +206,16 @@ def test_errors_decay_as_the_certificate_of_unlike_agents_says():
         (["agents.0.model=nothing"], "nothing"),
         (["agents.1.count=0"], "count"),
         (["safety={}"], "are alike"),
+        (["agents.0.model={name: bicycle}"], "moves at its trim"),
+        (["initial.spread={kind: 1}"], "of which group"),
+        (["formation.motion=[{rotate: 0.1}]"], "of agents of one model"),
         (["follower.observer={push: 8, scale: 1}"], "no input of `SingleIntegrator`"),
         (
             [
                 "agents.1.model={name: double-integrator, parameters: {dimension: 3}}",
-                "formation.offsets={0: [0, 0, 1]}",
+                "formation.offsets={2: [0, 0, 1], 0: [0, 0, 1]}",
             ],
-            "agent 0, a `walker`, has no `z`",
+            "agent 0, a `walker`, has no `z`, and its goal there is",
         ),
     ],
 )
@@ -173,6 +235,14 @@ def test_what_unlike_agents_cannot_be_is_one_sentence(change, said):
     assert ech.run(scenario).outcome.reached
     with pytest.raises(EchelonError, match=said):
         ech.build(scenario.with_(*change))
+
+
+def test_groups_have_names_of_their_own():
+    model = integrators(1)
+    named = UnlikeAgents.of([("a", 1, model), ("a", 1, model)])
+    assert named.names == ("a 1", "a 2")
+    with pytest.raises(EchelonError, match="groups have the names"):
+        UnlikeAgents.of([("a", 1, model), ("a", 1, model), ("a 2", 1, model)])
 
 
 def test_a_file_has_one_model_or_groups():

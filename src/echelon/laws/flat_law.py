@@ -18,6 +18,7 @@ from echelon.agents.models.chains import (
     to_flat,
 )
 from echelon.agents.models.model import ControlAffine, FlatBound
+from echelon.agents.models.relative_equilibrium import moves
 from echelon.agents.models.unlike import UnlikeAgents
 from echelon.agents.network.formation_motion import OwnOffset
 from echelon.core.compiled import cached_jit
@@ -154,8 +155,7 @@ class FlatLaw(Law, Speaks, Feeds, KeepsApart, Checks):
         ]
         loop = loops[0]
         if isinstance(model, UnlikeAgents):
-            if self.safety is not None:
-                raise LawError("`safety` is of agents that are alike, and these are not.")
+            self._check_unlike(model)
             loop = UnlikeLoop.of(model, loops, roots, agents)
         outputs = loop.chains.outputs
         if isinstance(self.speed, Sequence) and len(self.speed) != len(outputs):
@@ -164,6 +164,16 @@ class FlatLaw(Law, Speaks, Feeds, KeepsApart, Checks):
                 f"{listing(outputs)}."
             )
         return loop
+
+    def _check_unlike(self, model: UnlikeAgents) -> None:
+        if self.safety is not None:
+            raise LawError("`safety` is of agents that are alike, and these are not.")
+        for name, part in zip(model.names, model.models, strict=True):
+            if moves(part):
+                raise LawError(
+                    f"`{name}` moves at its trim, and unlike agents agree on where they rest; use "
+                    "a model that can stand still."
+                )
 
     def _roots_of(self, kinds: Sequence[tuple[ControlAffine, Chains]]) -> tuple[float, ...]:
         """Return as many roots as the longest chain of some models needs."""

@@ -312,6 +312,10 @@ class ControlAffine(Declared):
         """Return x - y; replaced where a coordinate is an angle."""
         return x - y
 
+    def own_state(self, x: State) -> State:
+        """Return a state after a step with what the agent has; the whole unless replaced."""
+        return x
+
     def limit(self, u: Input) -> Input:
         """Return the input that the actuators deliver for a requested u.
 

@@ -15,8 +15,8 @@ from echelon.core.types import Array, Input, InputMap, Output, State
 
 KIND = "kind"
 """The last state, which says of which group an agent is, from 0 on."""
-_BACK = 4.0
-"""1/s, at which what an agent does not have returns to where it stays: it never leaves it."""
+_AWAY = 1e-9
+"""m; what rounding leaves of an offset."""
 _Entry = TypeVar("_Entry")
 
 
@@ -53,6 +53,8 @@ class UnlikeAgents(ControlAffine):
         return cls(tuple(models), tuple(named), tuple(kinds), leader)
 
     def __check_init__(self) -> None:
+        if len(set(self.names)) < len(self.names):
+            raise ModelError(f"groups have the names {listing(self.names)}, allowed is each once.")
         for what in ("state_units", "trim"):
             seen = dict[str, tuple[object, str]]()
             for name, model in zip(self.names, self.models, strict=True):
@@ -121,22 +123,25 @@ class UnlikeAgents(ControlAffine):
             rest[..., agent, -1] = kind
         return rest
 
+    def check_goals(self, goals: Array) -> None:
+        """Raise `ModelError` where a goal (N, n) is off in a coordinate that an agent lacks."""
+        gaps = goals - self.settled(goals)
+        for agent, kind in enumerate(self.kinds):
+            for name in sorted({*self.position} - {*self.models[kind].position}):
+                away = float(gaps[agent, self.state_names.index(name)])
+                if abs(away) > _AWAY:
+                    raise ModelError(
+                        f"agent {agent}, a `{self.names[kind]}`, has no `{name}`, and its goal "
+                        f"there is {away:.4g} off; change its offset."
+                    )
+
     def with_kinds(self, offsets: Array) -> Array:
         """Return offsets (N, n) with those between the groups of agents and of the leader.
 
         Raises:
-            ModelError: there are more or fewer agents, or one has an offset in a coordinate that
-                neither it nor the leader has.
+            ModelError: there are more or fewer agents.
         """
         self.check_count(len(offsets))
-        for agent, kind in enumerate(self.kinds):
-            for name in {*self.position} - {*self.models[kind].position}:
-                own = offsets[agent, self.state_names.index(name)]
-                if own and name not in self.models[self.own_kind].position:
-                    raise ModelError(
-                        f"agent {agent}, a `{self.names[kind]}`, has no `{name}`, and its offset "
-                        f"there is {own:g}; allowed is 0."
-                    )
         return np.column_stack([offsets[:, :-1], np.array(self.kinds, float) - self.own_kind])
 
     def start_of(self, agent: int, state: Sequence[float]) -> Array:
@@ -164,6 +169,12 @@ class UnlikeAgents(ControlAffine):
             raise ModelError(
                 f"the groups have {len(self.kinds)} agents in all, and the graph {agents}."
             )
+
+    def states_called(self, name: str) -> tuple[int, ...]:
+        """Return the indices of a state or of a group of states; `kind` is nobody's to change."""
+        if name == KIND:
+            raise ModelError(f"got the state `{KIND}`, which says of which group an agent is.")
+        return super().states_called(name)
 
     def in_words(self) -> str:
         """Return which agents are of which group."""
@@ -266,16 +277,20 @@ class UnlikeAgents(ControlAffine):
         each = enumerate(self.models)
         return jnp.concatenate([model.limit(u[self.inputs_of(k)]) for k, model in each])
 
+    def own_state(self, x: State) -> State:
+        """Return a state of which nothing that the agent does not have has moved."""
+        kinds = range(len(self.models))
+        return self.chosen(x, [self.whole(k, x[self.states_of(k)]) for k in kinds])
+
     # ---- equations ----
 
     def drift(self, x: State) -> State:
         """Return f(x) of the agent's group."""
-        rest = jnp.asarray(np.asarray(self.trim[0], float), x.dtype).at[-1].set(jnp.round(x[-1]))
-        back = _BACK * (rest - x)
+        none = jnp.zeros_like(x)
         return self.chosen(
             x,
             [
-                back.at[self.states_of(k)].set(model.drift(self.part(k, x)))
+                none.at[self.states_of(k)].set(model.drift(self.part(k, x)))
                 for k, model in enumerate(self.models)
             ],
         )

@@ -131,6 +131,12 @@ class LocalCertificate(NamedTuple):
         return None if self.radius is None or not self.radius else -float(np.log(self.radius)) / dt
 
 
+def goals_at_rest(parts: Parts) -> Array:
+    """Return the goals (N, n) about a leader at the trim, each with what its agent has."""
+    goals = np.asarray(parts.model.trim[0], float) + parts.formation.offsets
+    return np.asarray(jax.vmap(parts.model.own_state)(jnp.asarray(goals)))
+
+
 def local_certificate(prepared: Prepared) -> LocalCertificate:
     """Return the certificate of prepared parts under laws, in float64."""
     parts, problem = prepared.parts, prepared.problem
@@ -143,7 +149,7 @@ def local_certificate(prepared: Prepared) -> LocalCertificate:
     period = period_of(problem, repeats)
     settled = _settled_after(prepared, period)
     loop = resting_loop(prepared, row, settled + 3 * period)
-    goals, answer = np.asarray(parts.model.trim[0], float) + parts.formation.offsets, reacts(parts)
+    goals, answer = goals_at_rest(parts), reacts(parts)
     counting = _counting(prepared, row, loop)
     for law in (parts.drive.follower, *[parts.drive.leader] * answer):
         timed = _timed(law, counting, parts.model, goals)

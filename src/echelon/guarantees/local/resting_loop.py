@@ -20,6 +20,7 @@ from jaxtyping import Float
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.relative_equilibrium import trim_velocity
+from echelon.agents.models.unlike import UnlikeAgents
 from echelon.agents.references.reference import LeaderPath
 from echelon.core.compiled import cached_jit, compiled_for_one_call
 from echelon.core.numerics import Field
@@ -138,8 +139,11 @@ def resting_leader(parts: Parts, answers: bool, ahead: float) -> Law:
 
 
 def reacts(parts: Parts) -> bool:
-    """Tell whether what leaders do depends on others."""
+    """Tell whether what leaders do counts: it depends on others, or nothing else is known of it."""
     words = parts.drive.information_for(parts.model, parts.graph).leader
+    if isinstance(parts.model, UnlikeAgents):
+        # No theorem is about their leaders: what they do counts as what others do.
+        return True
     return parts.drive.reacts or any(word.startswith("neighbours") for word in words)
 
 

@@ -39,7 +39,7 @@ from echelon.guarantees.promises.leaders import apart
 from echelon.guarantees.promises.modes import modes
 from echelon.guarantees.promises.promise import Guarantee
 from echelon.guarantees.promises.turning_lag import turning_lag
-from echelon.laws.law import Law, Proves
+from echelon.laws.law import Feeds, Law, Proves
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.drive import Controller
 from echelon.simulation.step.settings import Settings
@@ -264,7 +264,10 @@ def _matched(case: GuaranteeInputs) -> Statement:
     elif case.fed_by_parents:
         text = "each follower is sent its parent's input"
     else:
-        text = "every follower receives the leader's input, "
+        follower = getattr(case.parts.drive, "follower", None)
+        signal = any(Feeds.may(follower, name) for name in ("message", "broadcast"))
+        what = "feed-forward" if signal else "input"
+        text = f"every follower receives the leader's {what}, "
         text += "which the paper's network does not provide"
     return holds(name, Kind.PROOF, text)
 

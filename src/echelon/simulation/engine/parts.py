@@ -99,6 +99,10 @@ class Parts:
         object.__setattr__(self, "events", tuple(self.events))
         if isinstance(self.model, UnlikeAgents):
             places = self.formation
+            if places.motion is not None:
+                raise SimulationError(
+                    "a formation that moves is of agents of one model, and these are unlike."
+                )
             offsets = self.model.with_kinds(places.offsets)
             unlike = Formation(offsets, places.motion, places.remarks)
             object.__setattr__(self, "formation", unlike)
@@ -198,6 +202,8 @@ class Starts:
         self.named = {key: value for key, value in named.items() if not isinstance(key, str)}
         leaders = np.asarray(parts.drive.start(model), np.float64) + self.error
         self.goals = leaders + parts.formation.offsets_at([0.0])[0]
+        if isinstance(model, UnlikeAgents):
+            model.check_goals(self.goals)
 
     def __call__(self, seed: int) -> Float[Array, "N n"]:
         """Return the states (N, n) for a seed."""

@@ -241,7 +241,7 @@ class PlantStep(eqx.Module):
         """
         field, weather = self.field(memory[0], step, number)
         x, motors = self.motors.integrate(field, memory[1], x, u, self)
-        return x, (weather, motors)
+        return self.plant.own_state(x), (weather, motors)
 
     def advance(
         self,
