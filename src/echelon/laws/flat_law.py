@@ -211,8 +211,7 @@ class FlatLaw(Law, Speaks, Feeds, KeepsApart, Checks):
                 bounded = min(cap, share * left) / links if left > 0.0 else link
                 each[-1] |= dict.fromkeys(bound.outputs, bounded)
         # All groups agree on a place, so that the slowest sets the speed.
-        names = loop.chains.outputs
-        return tuple(min(x[name] for x in each if name in x) for name in names)
+        return tuple(min(x[y] for x in each if y in x) for y in loop.chains.outputs)
 
     def _left(self, chains: Chains, bound: FlatBound, slowest: float) -> float:
         degree = chains.degrees[chains.outputs.index(bound.outputs[0])]

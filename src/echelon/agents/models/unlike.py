@@ -353,6 +353,11 @@ def group_of(model: ControlAffine, agent: int) -> str:
     return model.names[model.kinds[agent]] if isinstance(model, UnlikeAgents) else ""
 
 
+def settled(model: ControlAffine, states: Array) -> Array:
+    """Return states (..., N, n), of unlike agents each with its own."""
+    return model.settled(states) if isinstance(model, UnlikeAgents) else states
+
+
 def _none(model: ControlAffine) -> Limits:
     m = len(model.input_names)
     return Limits(tuple(map(tuple, np.eye(m).tolist())), (-np.inf,) * m, (np.inf,) * m)

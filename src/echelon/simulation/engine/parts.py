@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from echelon.agents.models.model import ControlAffine
-from echelon.agents.models.unlike import UnlikeAgents
+from echelon.agents.models.unlike import UnlikeAgents, settled
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.agents.network.hearing import heard_along
@@ -97,16 +97,19 @@ class Parts:
             )
         self._check_starts()
         object.__setattr__(self, "events", tuple(self.events))
-        if isinstance(self.model, UnlikeAgents):
-            places = self.formation
-            if places.motion is not None:
-                raise SimulationError(
-                    "a formation that moves is of agents of one model, and these are unlike."
-                )
-            offsets = self.model.with_kinds(places.offsets)
-            unlike = Formation(offsets, places.motion, places.remarks)
-            object.__setattr__(self, "formation", unlike)
+        object.__setattr__(self, "formation", self._with_kinds())
         object.__setattr__(self, "graph", self.graph.with_events(self.events, self.backups))
+
+    def _with_kinds(self) -> Formation:
+        """Return the formation with the groups of unlike agents."""
+        places = self.formation
+        if not isinstance(self.model, UnlikeAgents):
+            return places
+        if places.motion is not None:
+            raise SimulationError(
+                "a formation that moves is of agents of one model, and these are unlike."
+            )
+        return Formation(self.model.with_kinds(places.offsets), remarks=places.remarks)
 
     def _check_starts(self) -> None:
         for named in (self.initial, self.start_error):
@@ -184,8 +187,8 @@ class Starts:
 
     def __init__(self, parts: Parts) -> None:
         model, graph, initial = parts.model, parts.graph, parts.initial
-        self.model = model
-        self.graph, self.shape = graph, (graph.agents, len(model.state_names))
+        self.model, self.graph = model, graph
+        self.shape = graph.agents, len(model.state_names)
         self.error = _per_state(model, parts.start_error, "start error")
         self.states: np.ndarray | None = None
         self.named: dict[int, ArrayLike] = {}
@@ -212,7 +215,7 @@ class Starts:
     def of(self, seeds: Sequence[int]) -> Float[Array, "K N n"]:
         """Return the states (K, N, n) for some seeds."""
         if self.states is not None:
-            return np.repeat(self.states[None], len(seeds), axis=0)
+            return np.repeat(settled(self.model, self.states)[None], len(seeds), axis=0)
         leaders = list(self.graph.leaders)
         # Drawn for all agents and scaled afterwards, so that another spread keeps the directions,
         # and another choice of leaders the followers' draws.
@@ -222,7 +225,7 @@ class Starts:
         states = self.goals + deviations
         _place(states, self.named, self.graph)
         states[:, [agent for agent in leaders if agent in self.named]] += self.error
-        return self.model.settled(states) if isinstance(self.model, UnlikeAgents) else states
+        return settled(self.model, states)
 
 
 def _place(states: Float[Array, "K N n"], named: Mapping[int, ArrayLike], graph: Graph) -> None:
