@@ -30,6 +30,7 @@ from .agents.world.world import World as World
 from .core import errors as errors
 from .core.errors import EchelonError as EchelonError
 from .core.errors import Outcome as Outcome
+from .core.words import Feedforward as Feedforward
 from .experiments.results.dataset import (
     dataset as dataset,
 )

@@ -323,8 +323,8 @@ SPOILED = [
         "`init` of `Sound` returns 'nothing yet', and must return arrays, numbers or nothing.",
     ),
     (
-        {"feedforward": "relay"},
-        "`feedforward` of `Sound` is 'relay', and must be a member of `Feedforward`, such as "
+        {"feedforward": 1},
+        "`feedforward` of `Sound` is 1, and must be a member of `Feedforward`, such as "
         "`Feedforward.RELAY`.",
     ),
     (
@@ -332,6 +332,12 @@ SPOILED = [
         "`prepared` of `Sound` returns a `NoneType`, and must return the completed law.",
     ),
 ]
+
+
+def test_a_class_gives_its_feedforward_by_name():
+    assert type("Relayed", (Sound,), {"feedforward": "relay"}).feedforward is ech.Feedforward.RELAY
+    with pytest.raises(ech.EchelonError, match=r"`relais`, allowed are `none`, `relay`"):
+        type("Misspelt", (Sound,), {"feedforward": "relais"})
 
 
 @pytest.mark.parametrize(("changes", "sentence"), SPOILED)

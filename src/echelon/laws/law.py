@@ -103,6 +103,13 @@ class Law(Declared):
     safety = cast("Safety | None", None)
     prover: ClassVar[str] = "echelon.guarantees.promises.metric_promise:MetricPromise"
 
+    def __init_subclass__(cls, **options: object) -> None:
+        """Read a `feedforward` that the class gives by its name, such as `relay`."""
+        super().__init_subclass__(**options)
+        if isinstance(vars(cls).get("feedforward"), str):
+            what = f"`feedforward` of `{cls.__name__}`"
+            cls.feedforward = Feedforward.checked(vars(cls)["feedforward"], what)
+
     @property
     def information(self) -> tuple[str, ...]:
         """What the law must receive from others, in words."""
