@@ -242,7 +242,7 @@ def test_a_file_that_is_no_mapping_is_refused(fault_of, tmp_path):
     for text, got in (("- 1\n", "`[1]`"), ("just text", '`"just text"`'), ("3", "`3`")):
         assert str(fault_of(text)) == (
             f"{tmp_path / 's.yaml'}:1: got {got}, allowed is a mapping with the keys `name`,"
-            " `model`, `plant`, `graph`, `formation`, `reference`, `leader`, `follower`,"
+            " `model`, `agents`, `plant`, `graph`, `formation`, `reference`, `leader`, `follower`,"
             " `safety`, `initial`, `disturbance`, `actuator`, `sensing`, `network`, `parts`,"
             " `events`, `leadership`, `simulation`, `report`, `live`, `seed`."
         )
@@ -253,8 +253,9 @@ def test_a_file_that_is_no_text_or_empty_is_refused(fault_of, tmp_path):
     assert said.startswith(f"{tmp_path}/s.yaml: this file cannot be read as UTF-8 text: ")
     lines = str(fault_of("# nothing yet\n")).splitlines()
     assert lines == [
-        f"{tmp_path}/s.yaml:1: {key}: got nothing, this key is required."
-        for key in ("name", "model", "graph", "simulation")
+        f"{tmp_path}/s.yaml:1: {key}: got nothing, this key{more} is required."
+        for key in ("name", "graph", "simulation", "model")
+        for more in (" or `agents`" if key == "model" else "",)
     ]
 
 

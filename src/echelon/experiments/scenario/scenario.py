@@ -268,6 +268,9 @@ def _scenario(document: Document, text: str, file: Path) -> Scenario:
     sentences: dict[KeyPath, str] = {}
     for path, sentence in (*_too_large(data), *map(_describe, errors)):
         sentences.setdefault(path, sentence)
+    if sentences and () not in sentences and not {*Scenario.one_of} & {*data}:
+        # Sections are looked at as a whole only where their keys are without fault.
+        sentences["model",] = "got nothing, this key or `agents` is required."
     faults = [ScenarioFault(document.place(path), joined(path), s) for path, s in sentences.items()]
     if scenario is None or faults or document.faults:
         refuse([*document.faults, *faults])
