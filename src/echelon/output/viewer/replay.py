@@ -171,7 +171,7 @@ def header(run: Recording, space: Space) -> JsonObject:
         "promise": _badge_of_run(run),
         "agents": run.agents,
         "leaders": list(run.leaders),
-        "groups": [group_name(run, k) for k in range(run.agents)] if is_unlike(run) else None,
+        "unlike": [group_name(run, k) for k in range(run.agents)] if is_unlike(run) else None,
         "nearest": run.nearest.tolist(),
         "edges": run.edges.tolist(),
         "heard": heard_by(run.heard),

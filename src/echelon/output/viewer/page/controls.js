@@ -187,7 +187,7 @@ class ViewControls {
     const information = senders.length ? `receives from ${senders.slice(0, 8).join(", ")}${senders.length > 8 ? " \u2026" : ""}` : "receives from nobody";
     const place = run.space.kind === "time" ? [p[at + 1] / run.space.stretch[1]] : [0, 1, 2].slice(0, run.space.names.length).map((k) => p[at + k] / [...run.space.stretch, 1][k]);
     const unit = run.space.units[run.space.kind === "time" ? 1 : 0];
-    card.replaceChildren(make("b", {}, `${leads ? "leader" : "follower"} ${selected}${run.groups ? `, ${run.groups[selected]}` : ""}`), make("span", {}, `at ${place.every(Number.isFinite) ? `${place.map((v) => v.toFixed(2)).join(", ")} ${unit}` : NOT_FINITE}`), make("br"));
+    card.replaceChildren(make("b", {}, `${leads ? "leader" : "follower"} ${selected}${run.unlike ? `, ${run.unlike[selected]}` : ""}`), make("span", {}, `at ${place.every(Number.isFinite) ? `${place.map((v) => v.toFixed(2)).join(", ")} ${unit}` : NOT_FINITE}`), make("br"));
     if (!leads || run.referenced) card.append(make("span", {}, Number.isFinite(away) ? `${brief(away)} ${unit} from its ${from}` : `error ${NOT_FINITE}`), make("br"));
     card.append(make("span", {}, information));
   }
