@@ -4,7 +4,8 @@ Agents agree on where they would come to rest in all outputs of all groups. An o
 does not have, such as the height of a rover, it carries for the others: as one integrator that
 moves at the rate that the law commands. An output whose chain is longer in another group follows
 what is commanded through a filter with the roots that its own chain lacks. So the same polynomial
-is between zeta and y in all groups, q(D) y' = k0 zeta', and agents that move keep their places.
+is between zeta and y in all groups, q(D) y' = k0 zeta', and agents that move keep their places, but
+for what held inputs leave of them, which is proportional to the step.
 """
 
 from typing import TYPE_CHECKING, final
@@ -40,8 +41,7 @@ class UnlikeLoop(eqx.Module):
         weights, stiffness: of the longest chains, as in `FlatLoop`.
         roots: (r - 1,) of q, 1/s.
         leading: the group of the leader.
-        present: the groups of the agents under the law. At the trim, where a leader may rest under
-            the law of followers of other groups, all groups are at the same place.
+        present: the groups of the agents under the law.
         observer: of all.
         angles: which outputs are angles.
     """

@@ -55,17 +55,19 @@ class UnlikeAgents(ControlAffine):
     def __check_init__(self) -> None:
         if len(set(self.names)) < len(self.names):
             raise ModelError(f"groups have the names {listing(self.names)}, allowed is each once.")
+        if any(KIND in model.state_names for model in self.models):
+            raise ModelError(f"got a state `{KIND}`, which is the number of a group; rename it.")
         for what in ("state_units", "trim"):
             seen = dict[str, tuple[object, str]]()
             for name, model in zip(self.names, self.models, strict=True):
                 values = model.trim[0] if what == "trim" else model.state_units
                 for state, value in zip(model.state_names, values, strict=True):
                     other, whose = seen.setdefault(state, (value, name))
-                    if other != value or state == KIND:
+                    if other != value:
                         raise ModelError(
                             f"the state `{state}` of `{name}` has the {what.split('_')[-1]} "
-                            f"{value!r}, and that of `{whose}` {other!r}: states of one name are "
-                            f"one state in a formation; `{KIND}` is a name of echelon's own."
+                            f"{value!r}, and that of `{whose}` {other!r}; states of one name are "
+                            "one state in a formation."
                         )
 
     # ---- whose is what ----
