@@ -104,10 +104,14 @@ class Guarantee(abc.ABC):
             try:
                 with precision("float64"):
                     prepared.parts.drive.accept(problem)
-                    outcome = self.of(prepared._replace(problem=problem), each, brief)
+                    outcome = self.again(prepared._replace(problem=problem), each, brief)
             except EchelonError as error:
                 outcome = error
             yield outcome
+
+    def again(self, prepared: Prepared, settings: Settings, brief: bool) -> "Guarantee":
+        """Return the same of parts that differ in the seed and in where agents start alone."""
+        return self.of(prepared, settings, brief)
 
     @property
     def governed(self) -> bool:

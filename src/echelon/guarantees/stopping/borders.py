@@ -20,7 +20,7 @@ from echelon.guarantees.stopping.chain_response import (
     spreads_on_pieces,
 )
 from echelon.guarantees.stopping.path_bounds import least_on_path
-from echelon.guarantees.stopping.stopping_run import StoppingRun
+from echelon.guarantees.stopping.stopping_run import StoppingRun, of_leaders
 
 # ---- bounds on the inner states of an agent from a known start -----------------------------------
 # Each output obeys q(D) v = -k0 w for its speed v less the leader's, with |w| <= s whatever the
@@ -199,6 +199,20 @@ def border_of(run: StoppingRun, bound: FlatBound) -> Border:
     Raises:
         GainError: there are too many different starts, or roots have no common unit.
     """
+    border, case = _ahead_of(run, bound)
+    if case is None:
+        return border
+    clearances, starts = _along(run, case) if border.many else _upward(run, case)
+    left = min(case.allowed - clearance.fall for clearance in clearances)
+    return border._replace(left=left, data={**border.data, "left": float(left), **starts})
+
+
+@of_leaders
+def _ahead_of(run: StoppingRun, bound: FlatBound) -> "tuple[Border, _BorderCase | None]":
+    """Return what no start of a follower changes, and of what the rest is computed.
+
+    Nothing is where a speed is infinite.
+    """
     chains, order = run.law.ready.chains, bound.derivative - 1
     places = [chains.outputs.index(name) for name in bound.outputs]
     chain = run.chain(places[0])
@@ -214,15 +228,14 @@ def border_of(run: StoppingRun, bound: FlatBound) -> Border:
     none = Fraction(-1), 0.0
     border = Border(bound, *none, least, fastest, led, math.inf, {}, bool(beside))
     if own is None or s is None:
-        return border
-    case = _BorderCase(run, bound, places, chain, own, s, allowed)
-    clearances, starts = _along(case) if border.many else _upward(case)
-    left = min(allowed - clearance.fall for clearance in clearances)
+        return border, None
+    case = _BorderCase(bound, places, chain, own, s, allowed)
     # Said of agents behind a leader that keeps to the speed of its path.
     steepest = float(length_clearance_of(chain, order, (), s, allowed).steepest)
-    data = {**_data(case, least, left), **starts, "steepest": steepest}
+    roots = run.law.roots_for(len(chain.powers))
+    data = {**_data(case, least, roots), "steepest": steepest}
     turn = _turn(run, places, steepest) if border.many and order == 0 else math.inf
-    return border._replace(left=left, steepest=steepest, turn=turn, data=data)
+    return border._replace(steepest=steepest, turn=turn, data=data), case
 
 
 def _is_on_path(run: StoppingRun, places: list[int]) -> bool:
@@ -241,7 +254,6 @@ def _turn(run: StoppingRun, places: list[int], chord: float) -> float:
 class _BorderCase(NamedTuple):
     """A border with what it is computed of: bounds of |w| of leader and agent, what is allowed."""
 
-    run: StoppingRun
     bound: FlatBound
     places: list[int]
     chain: Chain
@@ -259,24 +271,23 @@ def _together(speeds: Iterable[float]) -> Fraction | None:
     return exact[0] if len(exact) == 1 else root_bounds(sum((s**2 for s in exact), Fraction(0)))[1]
 
 
-def _data(case: _BorderCase, least: float, left: Fraction) -> dict[str, object]:
+def _data(case: _BorderCase, least: float, roots: Sequence[float]) -> dict[str, object]:
     chain, p = case.chain, len(case.chain.powers)
     return {
         "outputs": list(case.bound.outputs),
         "derivative": case.bound.derivative,
         "above": case.bound.above,
         "path": least,
-        "roots": list(case.run.law.roots_for(p)),
+        "roots": list(roots),
         "speed": float(case.speed),
         "leader_speed": float(case.own),
         "gains": [float(chain.gain(order)) for order in range(p + 1)],
-        "left": float(left),
     }
 
 
-def _upward(case: _BorderCase) -> tuple[list[Clearance], dict[str, object]]:
+def _upward(run: StoppingRun, case: _BorderCase) -> tuple[list[Clearance], dict[str, object]]:
     """Return the clearances of one output, which may go far on its other side, and the starts."""
-    run, [k], chain = case.run, case.places, case.chain
+    [k], chain = case.places, case.chain
     leads, p = list(run.parts.graph.leaders), len(chain.powers)
     led = _few(run.flat[leads, :, k] - run.ahead[:, k])
     away = _few(run.flat[:, :, k] - run.flat[list(run.parts.graph.nearest_leader()), :, k])
@@ -294,9 +305,9 @@ def _upward(case: _BorderCase) -> tuple[list[Clearance], dict[str, object]]:
     return clearances, {name: flat[:, 1 : p + 1].tolist() for name, flat in starts.items()}
 
 
-def _along(case: _BorderCase) -> tuple[list[Clearance], dict[str, object]]:
+def _along(run: StoppingRun, case: _BorderCase) -> tuple[list[Clearance], dict[str, object]]:
     """Return the clearances of several outputs, and the starts against the leader's path."""
-    run, p = case.run, len(case.chain.powers)
+    p = len(case.chain.powers)
     away = (run.flat - run.ahead)[:, 1 : p + 1, case.places].swapaxes(1, 2)
     if p == 1:
         # A length that falls by itself: the longest stands for all.

@@ -36,7 +36,7 @@ from echelon.guarantees.stopping.chain_response import Chain, TimeSlice, slices_
 from echelon.guarantees.stopping.flat_everywhere import airframe_fault
 from echelon.guarantees.stopping.linear_load import linear_limits
 from echelon.guarantees.stopping.path_bounds import Pieces, pieces_of
-from echelon.guarantees.stopping.stopping_run import StoppingRun
+from echelon.guarantees.stopping.stopping_run import StoppingRun, of_leaders
 from echelon.laws.stopping_point import StoppingLeader
 from echelon_ranges import ELEMENTARY, point
 
@@ -270,18 +270,25 @@ class _MotorCase(NamedTuple):
 
     @classmethod
     def of(cls, run: StoppingRun, frame: Airframe) -> "_MotorCase":
-        chain, graph = run.chain(0), run.parts.graph
-        speeds = _speeds([run.speed(k) for k in range(4)])
-        off = run.flat[list(graph.leaders)] - run.ahead
-        leader = _largest([_start(flat) for flat in off])
-        leader = leader._replace(speeds=_speeds([run.own_speed(k) for k in range(4)]))
-        demands = _path_demands(run.leader, run.parts.model, run.settings.horizon, chain)
-        if run.shifted is not None:
-            demands = tuple(_beside(run, demand) for demand in demands)
-        base = _pushed(chain, demands, leader, speeds)
+        graph = run.parts.graph
         away = (run.flat - run.flat[list(graph.nearest_leader())])[list(graph.followers)]
         starts = [_start(flat) for flat in np.unique(away, axis=0)]
-        return cls(frame, chain, demands, leader, speeds, base, starts)
+        return _led(run, frame)._replace(starts=starts)
+
+
+@of_leaders
+def _led(run: StoppingRun, frame: Airframe) -> _MotorCase:
+    """Return what is asked of agents that start as their leader."""
+    chain = run.chain(0)
+    speeds = _speeds([run.speed(k) for k in range(4)])
+    off = run.flat[list(run.parts.graph.leaders)] - run.ahead
+    leader = _largest([_start(flat) for flat in off])
+    leader = leader._replace(speeds=_speeds([run.own_speed(k) for k in range(4)]))
+    demands = _path_demands(run.leader, run.parts.model, run.settings.horizon, chain)
+    if run.shifted is not None:
+        demands = tuple(_beside(run, demand) for demand in demands)
+    base = _pushed(chain, demands, leader, speeds)
+    return _MotorCase(frame, chain, demands, leader, speeds, base, ())
 
 
 _at_limits = functools.partial(left_to_run, Hypothesis.LIMITS, NO_LIMIT)
@@ -302,7 +309,7 @@ def motor_load_of(run: StoppingRun, brief: bool = False) -> tuple[MotorLoad | No
         return None, _at_limits("the motors of an agent have other limits than the model's")
     kind = Kind.SAMPLES if is_by_user(run.parts.model, "airframe") else Kind.PROOF
     case = _MotorCase.of(run, frame)
-    if brief and not _suffice_at_rest(frame, case.chain, case.base):
+    if brief and not _suffice_at_rest(run, frame):
         return None, _at_limits("the motors are not proved to suffice from any start", kind=kind)
     motors, starts = _from(case)
     most = Fraction(frame.motor_thrust)
@@ -328,6 +335,7 @@ def motor_load_of(run: StoppingRun, brief: bool = False) -> tuple[MotorLoad | No
     return load, holds(Hypothesis.LIMITS, kind, text, *number)
 
 
+@of_leaders
 def _airframe(run: StoppingRun) -> tuple[Airframe | None, str]:
     model, reason = run.parts.model, _beyond(run)
     frame = None if undeclared(model, "airframe") else model.airframe
@@ -422,9 +430,10 @@ def _pushed(
     return tuple(add_pushes(piece, demand, (leader, own)) for piece, demand in pairs)
 
 
-@memoize
-def _suffice_at_rest(frame: Airframe, chain: Chain, base: tuple[MotorDemand, ...]) -> bool:
-    return motors_suffice(frame, slices_of(chain), base, _STILL)
+@of_leaders
+def _suffice_at_rest(run: StoppingRun, frame: Airframe) -> bool:
+    case = _led(run, frame)
+    return motors_suffice(frame, slices_of(case.chain), case.base, _STILL)
 
 
 def _from(case: _MotorCase) -> tuple[Motors, Sequence[Pushed]]:

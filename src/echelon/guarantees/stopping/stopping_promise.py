@@ -12,7 +12,7 @@ from echelon.core.words import Kind
 from echelon.guarantees.messages.late_messages import messages_line
 from echelon.guarantees.messages.own_delay import OwnCase, own_delay_line
 from echelon.guarantees.promises.case import GuaranteeInputs
-from echelon.guarantees.promises.closed_loop import loop_of
+from echelon.guarantees.promises.closed_loop import LinearLoop, loop_of
 from echelon.guarantees.promises.hypotheses import agent_lines
 from echelon.guarantees.promises.leaders import leaders_of
 from echelon.guarantees.promises.promise import AgreementModes, Guarantee
@@ -22,9 +22,11 @@ from echelon.guarantees.stopping.stopping_run import (
     StoppingRun,
     agreement_modes,
     condition_lines,
+    of_leaders,
     stopping_run_of,
 )
 from echelon.guarantees.stopping.tube import Tube, tube_of
+from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import Prepared
 from echelon.simulation.step.drive import Problem
 from echelon.simulation.step.settings import Settings
@@ -52,27 +54,31 @@ class StoppingPromise(Guarantee):
     @classmethod
     def of(cls, prepared: Prepared, settings: Settings, brief: bool = False) -> "StoppingPromise":
         """Return what is guaranteed of prepared parts; `brief` leaves out arrival."""
-        parts, states = prepared.parts, prepared.problem.states
-        run, leaders = stopping_run_of(parts, settings, states), leaders_of(parts, states)
-        case = GuaranteeInputs(parts, settings, loop_of(parts), leaders)._replace(
-            over_network=run.network is not None
-        )
-        (tube, tube_lines), drifts = tube_of(run, brief), drift_line(run)
-        lines = [*agent_lines(case), *condition_lines(run), *tube_lines]
+        run = stopping_run_of(prepared.parts, settings, prepared.problem.states)
+        return cls._of_run(run, prepared, brief)
+
+    def again(self, prepared: Prepared, settings: Settings, brief: bool) -> "StoppingPromise":
+        """Return the same from other starts, computing only what they change."""
+        return self._of_run(self.run.again(settings, prepared.problem.states), prepared, brief)
+
+    @classmethod
+    def _of_run(cls, run: StoppingRun, prepared: Prepared, brief: bool) -> "StoppingPromise":
+        loop, ignored, leader_mode, known = _known_lines(run, prepared.parts)
+        tube, tube_lines = tube_of(run, brief)
         own = None if brief else _own_line(run, prepared.problem)
-        more = drifts, messages_line(parts, settings, run.late), own
-        lines += [line for line in more if line is not None]
+        more = drift_line(run), own
+        lines = [*known, *tube_lines, *(line for line in more if line is not None)]
         by_name = {cast(Hypothesis, x.statement): x for x in lines}
         against = any(line.fails and line.reason for line in by_name.values())
         tube = None if against else tube
-        separation = separation_of(run, tube, bool(case.ignored))
+        separation = separation_of(run, tube, bool(ignored))
         if separation is not None:
             by_name[Hypothesis.SEPARATION] = separation.line
         return cls(
-            loop=case.loop,
+            loop=loop,
             hypotheses=MappingProxyType(by_name),
-            ignores=case.ignored,
-            leader_mode=leaders.slowest,
+            ignores=ignored,
+            leader_mode=leader_mode,
             complete=not brief,
             run=run,
             # In float64, which a law computes in only here.
@@ -144,6 +150,24 @@ class StoppingPromise(Guarantee):
         if self.tube is None or self.separation is None:
             return None if self.tube is None else self.tube.as_mapping()
         return self.tube.as_mapping() | {"separation": self.separation.as_mapping()}
+
+
+@of_leaders
+def _known_lines(
+    run: StoppingRun, parts: Parts
+) -> tuple[LinearLoop, tuple[str, ...], float | None, list[Statement]]:
+    """Return the loop near the trim, what is ignored, the leaders' mode, and lines.
+
+    These are of no start of a follower.
+    """
+    leaders = leaders_of(parts, run.states)
+    case = GuaranteeInputs(parts, run.settings, loop_of(parts), leaders)._replace(
+        over_network=run.network is not None
+    )
+    messages = messages_line(parts, run.settings, run.late)
+    lines = [*agent_lines(case), *condition_lines(run)]
+    lines += [] if messages is None else [messages]
+    return case.loop, case.ignored, leaders.slowest, lines
 
 
 def _own_line(run: StoppingRun, problem: Problem) -> Statement | None:

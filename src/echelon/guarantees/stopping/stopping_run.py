@@ -1,9 +1,10 @@
 """A run in flat coordinates, and the hypotheses of theorem T5 beside its tube."""
 
+import functools
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Hashable, Iterable, Iterator
 from fractions import Fraction
-from typing import NamedTuple
+from typing import Any, Concatenate, NamedTuple, ParamSpec, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -196,6 +197,29 @@ _TOGETHER = 1e-9
 """In flat coordinates; leaders that start nearer to each other differ by rounding."""
 
 
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+_NO_SEED = -1
+
+
+def of_leaders(
+    function: Callable[Concatenate["StoppingRun", _P], _R],
+) -> Callable[Concatenate["StoppingRun", _P], _R]:
+    """Return a function of a run that computes once for all starts of followers, and all seeds.
+
+    It is given a run whose followers are nowhere, so that it cannot depend on where they start.
+    """
+
+    @functools.wraps(function)
+    def once(run: "StoppingRun", *args: _P.args, **named: _P.kwargs) -> _R:
+        key = function.__qualname__, args, tuple(named.items())
+        if key not in run.kept:
+            run.kept[key] = function(run.without_followers(), *args, **named)
+        return cast(_R, run.kept[key])
+
+    return once
+
+
 class StoppingRun(NamedTuple):
     """A run under the law, as its theorem sees it.
 
@@ -205,6 +229,7 @@ class StoppingRun(NamedTuple):
         ahead: (r, m) of what the leader follows.
         late: what is guaranteed over its network; None for the ideal one.
         left_out: why nothing is known of how its graph switches in steps; empty elsewhere.
+        kept: what follows from all but the seed and where followers start, see `of_leaders`.
     """
 
     parts: Parts
@@ -212,8 +237,26 @@ class StoppingRun(NamedTuple):
     states: Array
     flat: Array
     ahead: Array
+    kept: dict[Hashable, Any]
     late: LateMessages | Uncovered | None = None
     left_out: str = ""
+
+    def again(self, settings: Settings, states: Array) -> "StoppingRun":
+        """Return a run that differs in its seed and in where agents start alone."""
+        leads = list(self.parts.graph.leaders)
+        if not np.array_equal(states[leads], self.states[leads]):
+            return stopping_run_of(self.parts, settings, states)
+        flat = flat_starts(self.parts, self.law, states)
+        return self._replace(settings=settings, states=states, flat=flat)
+
+    def without_followers(self) -> "StoppingRun":
+        """Return the same with followers nowhere, and no seed."""
+        nowhere = np.ones(len(self.states), bool)
+        nowhere[list(self.parts.graph.leaders)] = False
+        states, flat = (np.array(x, float) for x in (self.states, self.flat))
+        states[nowhere], flat[nowhere] = np.nan, np.nan
+        settings = self.settings._replace(seed=_NO_SEED)
+        return self._replace(states=states, flat=flat, settings=settings)
 
     @property
     def law(self) -> StoppingPoint:
@@ -226,11 +269,13 @@ class StoppingRun(NamedTuple):
         return self.parts.drive.leader  # pyright: ignore
 
     @property
+    @of_leaders
     def coupling(self) -> float:
         """C."""
         return float(self.law.strength(self.settings.dt))
 
     @property
+    @of_leaders
     def rate(self) -> float:
         """The slowest mode of the formation, 1/s, as a positive number."""
         root = [self.law.slowest_root] if max(self.law.ready.chains.degrees) > 1 else []
@@ -243,6 +288,7 @@ class StoppingRun(NamedTuple):
         return self.late if isinstance(self.late, LateMessages) else None
 
     @property
+    @of_leaders
     def still(self) -> bool:
         """Whether the leader is where it stays, from the start on."""
         outputs, motion = range(len(self.law.ready.chains.outputs)), self.parts.formation.motion
@@ -251,11 +297,13 @@ class StoppingRun(NamedTuple):
         return self.leader.reference is None and max(map(self.own_speed, outputs)) < _TOGETHER
 
     @property
+    @of_leaders
     def apart(self) -> bool:
         """Whether leaders start apart, so that their own agreement is in the errors."""
         return bool(np.ptp(self.flat[list(self.parts.graph.leaders)], axis=0).max() > _TOGETHER)
 
     @property
+    @of_leaders
     def agreement(self) -> float:
         """The slowest disagreement of stopping points near rest, 1/s, as a positive number.
 
@@ -280,6 +328,7 @@ class StoppingRun(NamedTuple):
         left = max(float(np.abs(np.linalg.eigvals(flow)).max()), np.finfo(float).tiny)
         return -math.log(left) / schedule.period
 
+    @of_leaders
     def chain(self, output: int) -> Chain:
         """Return the chain of an output.
 
@@ -289,6 +338,7 @@ class StoppingRun(NamedTuple):
         degree = self.law.ready.chains.degrees[output]
         return Chain.of(self.law.roots_for(degree - 1))
 
+    @of_leaders
     def speed(self, output: int) -> float:
         """Return s of a follower against the leader: of each link on the way, told by parents.
 
@@ -305,6 +355,7 @@ class StoppingRun(NamedTuple):
         # With `safety` the rate of an offset is within the speed, like any other.
         return None if self.law.safety is not None else self.parts.formation.motion
 
+    @of_leaders
     def offset_size(self, order: int, *outputs: int) -> Fraction:
         """Return a bound of a derivative of offsets, the norm of some outputs, beside the path.
 
@@ -314,6 +365,7 @@ class StoppingRun(NamedTuple):
         names = [self.law.ready.chains.outputs[k] for k in outputs]
         return size_beside(self.shifted, self.parts.model.position, names, order)
 
+    @of_leaders
     def path_speed(self, output: int, until: float | None = None) -> float:
         """Return what |zeta_r'| of the leader's path does not pass until a time (s), or at all.
 
@@ -329,6 +381,7 @@ class StoppingRun(NamedTuple):
         return int(self.parts.graph.depths().max()) if told else 1
 
     @property
+    @of_leaders
     def longest_step(self) -> float:
         """The longest step (s) that keeps the largest stopping point from growing."""
         return 1.0 / (self.coupling * self.heaviest)
@@ -339,6 +392,7 @@ class StoppingRun(NamedTuple):
         assert self.law.reach is not None
         return self.law.reach.heaviest if self.network is None else float(self.network.sums.max())
 
+    @of_leaders
     def own_speed(self, output: int) -> float:
         """Return the speed against its path that a leader may have: what it starts off, or s_0."""
         leads = list(self.parts.graph.leaders)
@@ -358,8 +412,8 @@ def stopping_run_of(parts: Parts, settings: Settings, states: Array) -> Stopping
     graph, left_out = _in_steps(parts.graph, settings.dt)
     if graph is not parts.graph:
         parts = parts.replace(graph=graph, events=graph.events)
-    run = StoppingRun(parts, settings, states, flat, beginning_of(drive.leader, parts.model))
-    run, leaderward = run._replace(left_out=left_out), drive.follower.leaderward
+    ahead, leaderward = beginning_of(drive.leader, parts.model), drive.follower.leaderward
+    run = StoppingRun(parts, settings, states, flat, ahead, {}, None, left_out)
     speed = min(map(run.law.speed_of, range(len(run.law.ready.chains.outputs))))
     avoiding = run.law.safety is not None
     following = Following(graph, leaderward, run.coupling, speed, run.still, run.apart, avoiding)
@@ -382,8 +436,13 @@ def _in_steps(graph: Graph, dt: float) -> tuple[Graph, str]:
 # ---- what else it rests on -----------------------------------------------------------------------
 
 
-def condition_lines(run: StoppingRun) -> Iterator[Statement]:
-    """Yield the conditions of T5 beside the tube."""
+@of_leaders
+def condition_lines(run: StoppingRun) -> list[Statement]:
+    """Return the conditions of T5 beside the tube."""
+    return [*_condition_lines(run)]
+
+
+def _condition_lines(run: StoppingRun) -> Iterator[Statement]:
     c = run.coupling
     yield _offsets_line(run)
     text = "in flat coordinates every agent is linear, with or without a trim"
