@@ -19,17 +19,20 @@ from in_words import in_words
 from processes import started, wait_for
 
 import echelon as ech
+from echelon.core.numerics import precision
 from echelon.experiments.scenario.yaml import inline_yaml
 from echelon.experiments.sweeps import workers as sweeps
 from echelon.experiments.sweeps.plan import Axis, Sweep, axes_of, read_axes
 from echelon.experiments.sweeps.sweep import _missing, compute
 from echelon.experiments.sweeps.sweep_dataset import columns_of, dataset_of, share_bounds, succeeded
 from echelon.experiments.sweeps.workers import SweepBatch
-from echelon.guarantees.promises.promise import guarantee, promises
+from echelon.guarantees.promises.promise import Guarantee, guarantee, promises
+from echelon.guarantees.stopping.stopping_promise import StoppingPromise
 from echelon.output.plots.study_figures import sweep_figures
 from echelon.simulation.engine import batch, law_drive
 from echelon.simulation.engine import batch as batches
 from echelon.simulation.engine.batch import Batch
+from echelon.simulation.engine.parts import initial_states
 
 SHORT = ["simulation.horizon=0.5", "simulation.dt=0.01", "report.steady_window=0.1"]
 
@@ -635,3 +638,32 @@ def test_numbers_of_numpy_are_numbers():
     assert axes_of({"seed": [np.int32(4), np.uint8(5)]})[0].text == "seed=4, 5"
     vectors = {"graph.leaders": [np.array([0]), (np.int64(0), 1)], "model.x": [np.float32(0.5)]}
     assert [axis.values for axis in axes_of(vectors)] == [([0], [0, 1]), (0.5,)]
+
+
+@pytest.mark.parametrize(
+    ("name", "sets"),
+    [
+        pytest.param("paper-radio", (), marks=pytest.mark.slow),
+        ("paper-global", ("initial={spread: {attitude: 0.02, velocity: 0.2, rate: 0.1}}",)),
+        ("integrators", ("initial={spread: {position: 1.0}}",)),
+    ],
+)
+def test_what_is_kept_for_other_seeds_is_what_each_would_compute(name, sets, monkeypatch):
+    parts, chosen = built(name, *sets)
+    asked = [chosen._replace(seed=seed) for seed in range(4)]
+
+    def told():
+        return [each.as_mapping() for each in promises(parts.replace(), asked, brief=True)]
+
+    kept = told()
+    monkeypatch.setattr(StoppingPromise, "again", Guarantee.again)
+    assert kept == told()
+
+
+def test_starts_are_the_same_whatever_their_caller_computes_in():
+    parts, _ = built("paper-radio")
+    with precision("float32"):
+        single = initial_states(parts, 3)
+    with precision("float64"):
+        double = initial_states(parts, 3)
+    np.testing.assert_array_equal(single, double)

@@ -21,6 +21,7 @@ from echelon.agents.network.hearing import heard_along
 from echelon.agents.part import Event
 from echelon.agents.world.world import World
 from echelon.core.errors import SimulationError, check_kind
+from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.core.words import amount
 from echelon.simulation.step.drive import Controller, Information
@@ -203,8 +204,10 @@ class Starts:
         spreads = {key: value for key, value in named.items() if isinstance(key, str)}
         self.spread = _per_state(model, spreads, "initial spread")
         self.named = {key: value for key, value in named.items() if not isinstance(key, str)}
-        leaders = np.asarray(parts.drive.start(model), np.float64) + self.error
-        self.goals = leaders + parts.formation.offsets_at([0.0])[0]
+        # Whatever the caller computes in: one who asked in float32 had goals that are .1 um off.
+        with precision("float64"):
+            leaders = np.asarray(parts.drive.start(model), np.float64) + self.error
+            self.goals = leaders + parts.formation.offsets_at([0.0])[0]
         if isinstance(model, UnlikeAgents):
             model.check_goals(self.goals)
 
