@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 from processes import without_status
 
+import echelon as ech
 from echelon.agents.models import Pendulum, VanDerPol
 from echelon.agents.models.linearization import AtTrim, at_trim
 from echelon.agents.models.model import ControlAffine
@@ -31,6 +32,7 @@ from echelon.core.compiled import CompiledFunction
 from echelon.core.numerics import precision
 from echelon.core.words import Kind
 from echelon.experiments.scenario.named_class import user_class
+from echelon.simulation.native import kernel_cache, stepper
 
 
 @pytest.fixture
@@ -447,3 +449,31 @@ def test_a_program_is_that_of_what_is_set_and_of_arrays_that_are_not_traced(fold
     for numbers in (np.array([1.0, 2.0]), np.array([3.0, 4.0])):
         with precision("float64"):
             np.testing.assert_array_equal(made(Still(Box(numbers)), np.ones(2)), numbers)
+
+
+def test_the_text_of_a_kernel_is_found_by_what_runs_and_never_of_somebody_s_own_class(
+    folder, monkeypatch
+):
+    def flown(model, speed=1.0):
+        graph = ech.Graph.path(3)
+        laws = ech.laws.StoppingLeader(speed=speed), ech.laws.StoppingPoint(speed=speed)
+        offsets = ech.Formation.from_offsets(model, graph, {})
+        parts = ech.Parts(model, graph, offsets, ech.Laws(*laws))
+        parts = parts.replace(initial={model.state_names[0]: 1.0})
+        monkeypatch.setattr(kernel_cache, "KERNELS", kernel_cache.Kernels())
+        monkeypatch.setattr(stepper, "KERNELS", kernel_cache.KERNELS)
+        chosen = ech.Settings(horizon=1.0, dt=0.01, engine="native", steady_window=None)
+        return ech.simulate(parts, chosen).states
+
+    first, other = flown(Pendulum()), flown(Pendulum(), 0.1)
+    assert (first != other).any()
+    with monkeypatch.context() as patch:
+        patch.setattr(kernel_cache, "plan_of", again)
+        np.testing.assert_array_equal(flown(Pendulum()), first)
+        np.testing.assert_array_equal(flown(Pendulum(), 0.1), other)
+        with pytest.raises(AssertionError, match="made again"):
+            flown(OwnPendulum())
+
+
+class OwnPendulum(Pendulum):
+    """A user's model."""

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from echelon.agents.models.model import FlatBound
+from echelon.core.cache import memoize
 from echelon.core.errors import GainError, listing
 from echelon.core.rational import float_below, root_bounds
 from echelon.core.types import Array
@@ -124,6 +125,7 @@ class _Piece(NamedTuple):
 
 
 @functools.lru_cache(32)
+@memoize
 def _pieces(chain: Chain, order: int) -> tuple[_Piece, ...]:
     """Return the pieces in the order of time, which goes on as x falls from 1 to 0."""
     only = [Fraction(1), *[Fraction(0)] * (len(chain.powers) - 1)]

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from fractions import Fraction
 from typing import NamedTuple, final
 
+from echelon.core.cache import memoize
 from echelon.core.digits import about
 from echelon.core.errors import GainError
 from echelon.core.rational import round_up
@@ -265,6 +266,7 @@ class TimeSlice(NamedTuple):
 
 
 @functools.lru_cache(32)
+@memoize
 def slices_of(chain: Chain) -> tuple[TimeSlice, ...]:
     """Return the slices of all time, for a chain of one root or more."""
     first = Chain(chain.powers[:1], chain.unit)

@@ -11,7 +11,7 @@ SHIFTED = 2
 NO_MINIMUM = 2**31 - 1
 """The minimum in a row that has none yet: no step has that number."""
 _Part: TypeAlias = Mapping[int, Node] | Sequence[Node]
-_NONE: Mapping[int, Node] = MappingProxyType({})
+_NONE: Mapping[int, Node] = {}
 
 
 class Body(NamedTuple):

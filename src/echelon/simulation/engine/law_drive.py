@@ -36,7 +36,7 @@ from echelon.laws.safety import Safety
 from echelon.laws.safety_check import check_numbers, hulls_at, separations, too_near
 from echelon.simulation.engine.jax_stepper import JaxStepper
 from echelon.simulation.native import is_installed
-from echelon.simulation.native.agent_step import BlockRows
+from echelon.simulation.native.agent_step import memories_of
 from echelon.simulation.native.stepper import NativeStepper
 from echelon.simulation.scalars import Unsupported
 from echelon.simulation.step.assembly import assemble
@@ -259,7 +259,7 @@ class Laws(Controller):
         """
         if problem.settings.engine == "native":
             loop = assemble(problem, self.leader, self.follower)
-            choose_engine(problem.settings, 0, lambda: BlockRows.of(loop), lambda _: None)
+            choose_engine(problem.settings, 0, lambda: memories_of(loop), lambda _: None)
 
     def warnings(self, model: ControlAffine, graph: Graph, settings: Settings) -> tuple[str, ...]:
         """Return the warnings of both laws, and of what they cannot follow or do not hear."""

@@ -138,12 +138,12 @@ class BlockRows(NamedTuple):
     total: int
 
     @classmethod
-    def of(cls, loop: Loop, varying: int = 0) -> "BlockRows":
-        """Return a loop's rows; `Unsupported` if it has no native code."""
-        check_loop(loop)
+    def of(
+        cls, loop: Loop, memories: tuple[ComponentMemory, ComponentMemory], varying: int = 0
+    ) -> "BlockRows":
+        """Return a loop's rows, given what its agents remember."""
         n, m = len(loop.model.state_names), len(loop.model.input_names)
-        memories = [memory_size(memory_of(loop, leads)) for leads in (True, False)]
-        sizes = [n, n, sum(map(row_size, agent_rows(loop)[1:])), max(memories)]
+        sizes = [n, n, sum(map(row_size, agent_rows(loop)[1:])), max(map(memory_size, memories))]
         late = letter_sizes(loop)
         sizes += [sum(sensed_sizes(loop)) * listens_first(loop)]
         sizes += [0 if late is None else late.packet + 1, m, forward_size(loop), m, varying]
@@ -242,6 +242,15 @@ def memory_of(loop: Loop, leads: bool) -> ComponentMemory:
         return begin(own, jnp.zeros((1, len(loop.model.state_names)))).memory
 
     return jax.eval_shape(begun)
+
+
+def memories_of(loop: Loop) -> tuple[ComponentMemory, ComponentMemory]:
+    """Return that of a leader and of a follower; `Unsupported` if there is no native code."""
+    check_loop(loop)
+    memories = memory_of(loop, True), memory_of(loop, False)
+    for memory in memories:
+        memory_size(memory)
+    return memories
 
 
 def memory_size(memory: PyTree) -> int:

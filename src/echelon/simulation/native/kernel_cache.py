@@ -5,21 +5,23 @@ from typing import NamedTuple, final
 import jax
 import numpy as np
 
-from echelon.core.cache import BoundedCache
+from echelon.core.cache import BoundedCache, load_or_compute
 from echelon.core.numerics import precision
 from echelon.laws.law import Travels
-from echelon.simulation.codegen import Code, Letters, Plan, has_flag, program, shared
+from echelon.simulation.codegen import Body, Code, Letters, Plan, has_flag, program, shared
 from echelon.simulation.native.agent_step import (
     BlockRows,
     letter_sizes,
+    memories_of,
     program_of,
     shown_goals,
     shown_size,
 )
 from echelon.simulation.native.blocks import Shifts
 from echelon.simulation.native.varying import VaryingNumbers
-from echelon.simulation.scalars import HostPart
+from echelon.simulation.scalars import HostPart, needed
 from echelon.simulation.step.loop import Loop
+from echelon.simulation.step.records import ComponentMemory
 from echelon.simulation.step.turns import by_depth
 
 LANES = {64: 8, 32: 16}
@@ -38,22 +40,33 @@ def follows(loop: Loop) -> bool:
         )
 
 
-class Kernel(NamedTuple):
-    """The code that steps some loops.
+class KernelText(NamedTuple):
+    """What steps some loops, before it is machine code.
 
     Attributes:
-        code: machine code.
+        text: for LLVM.
         rows: that it works on.
-        plan: that it was compiled from.
+        plan: that it was written from, whose bodies are empty now.
         uniform_count: how many numbers are the same for all agents at a step.
+        work: how many operations a step of a follower has.
+        memories: of a leader and a follower, as shapes.
         given: what the host computes ahead for leaders and all others.
     """
 
-    code: Code
+    text: str
     rows: BlockRows
     plan: Plan
     uniform_count: int
+    work: int
+    memories: tuple[ComponentMemory, ComponentMemory]
     given: tuple[HostPart, HostPart]
+
+
+class Kernel(NamedTuple):
+    """The machine code that steps some loops, and from what it was made."""
+
+    code: Code
+    made: KernelText
 
 
 def letters_of(loop: Loop, rows: BlockRows) -> Letters | None:
@@ -121,13 +134,16 @@ def plan_of(
     return plan, (first.given, others.given)
 
 
-def compiled(
-    rows: BlockRows, plan: Plan, given: tuple[HostPart, HostPart], codes: BoundedCache[Code]
-) -> Kernel:
-    """Return the kernel of a plan; `codes` by text, since another graph has the same code."""
-    text = program(plan)
-    code = codes.get_or_make(text, lambda: Code(text))
-    return Kernel(code, rows, plan, len(shared(plan)), given)
+def text_of(
+    rows: BlockRows,
+    plan: Plan,
+    given: tuple[HostPart, HostPart],
+    memories: tuple[ComponentMemory, ComponentMemory],
+) -> KernelText:
+    """Return the text of a plan, without the nodes from which it was written."""
+    work, count = 1 + len(needed(plan.others.results())), len(shared(plan))
+    bare = plan._replace(**dict.fromkeys(plan.bodies, Body()))
+    return KernelText(program(plan), rows, bare, count, work, memories, given)
 
 
 @final
@@ -161,10 +177,19 @@ class Kernels:
         own = jax.tree.structure((varying.loop.places, varying.loop.motion.rows))
         key = (signature, own, bits, LANES[bits], batched, row_major, weighted, apart, shifts)
 
-        def make() -> Kernel:
-            rows = BlockRows.of(varying.loop, varying.count)
+        def write() -> KernelText:
+            loop = varying.loop
+            memories = memories_of(loop)
+            rows = BlockRows.of(loop, memories, varying.count)
             parts = plan_of(varying, rows, bits, batched, row_major, weighted, apart, shifts)
-            return compiled(rows, *parts, self.codes)
+            return text_of(rows, *parts, memories)
+
+        def make() -> Kernel:
+            rows = varying.loop.places, varying.loop.motion.rows
+            # To trace a step takes longer than to read its text; numbers given ahead are no text.
+            made = load_or_compute(write, "kernel", signature, rows, *key[2:])
+            # By its text, since another graph has the same code.
+            return Kernel(self.codes.get_or_make(made.text, lambda: Code(made.text)), made)
 
         return self._kernels.get_or_make(None if signature is None else key, make)
 

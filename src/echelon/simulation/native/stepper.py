@@ -18,7 +18,6 @@ from echelon.simulation.codegen import aligned, stride
 from echelon.simulation.native.agent_step import (
     agent_rows,
     listens_first,
-    memory_of,
     memory_size,
     shown_size,
 )
@@ -29,7 +28,6 @@ from echelon.simulation.native.mail_table import MailTable
 from echelon.simulation.native.pair_watch import PairWatch
 from echelon.simulation.native.threads import ThreadPool
 from echelon.simulation.native.varying import VaryingNumbers
-from echelon.simulation.scalars import needed
 from echelon.simulation.step.drive import Chunk, Stepper
 from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.meter import ALWAYS, Sums
@@ -90,15 +88,13 @@ class NativeStepper(Stepper):
         row_major, weights_change = self.places.row_major, variant is not None
         apart = weights_change or any(np.any(loop.meter.spacings) for loop in loops)
         self.places.listens_first = listens_first(self.loop)
-        self.code, self.rows, self.plan, self.uniform_count, parts = KERNELS.of(
+        self.code, made = KERNELS.of(
             self.varying, bits, batched, row_major, weights_change, apart, self.places.shifts
         )
+        _, self.rows, self.plan, self.uniform_count, self._work, self.memories, parts = made
         self.given = GivenTable(self.varying, loops, parts, self.places, self.plan, self.dtype)
         letters = self.plan.letters
         self.mail = letters and MailTable(loops, self.places, letters, self.dtype)
-        # Once, because to call a law takes as long as many small steps.
-        self.memories = [memory_of(self.loop, leads) for leads in (True, False)]
-        self._work = 1 + len(needed(self.plan.others.results()))
         self._reserve()
         # The moment in the blocks: a chunk that continues from it need not be written there.
         self._moment: LoopState | None = None

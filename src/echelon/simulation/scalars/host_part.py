@@ -27,6 +27,12 @@ class HostPart:
     def __init__(self) -> None:
         self.size, self._traces = 0, list[ClosedJaxpr]()
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what is stored on disk: nothing that was traced, which no other process knows."""
+        if self._traces:
+            raise TypeError("a trace is known in its own process alone")
+        return {"size": self.size, "_traces": []}
+
     def split(
         self, closed: ClosedJaxpr, count: int, step: int, graph: ScalarGraph
     ) -> tuple[Jaxpr, list[np.ndarray]]:
