@@ -280,6 +280,18 @@ def test_a_part_of_your_own_is_no_subclass_of_echelons():
     assert str(caught.value) == said
 
 
+class Choosy(Sensed):
+    """A sensor that suits no law."""
+
+    def check_laws(self, laws, graph, dt):
+        raise EchelonError(f"`{type(laws.follower).__name__}` needs more than this sensor.")
+
+
+def test_a_part_of_your_own_may_refuse_laws():
+    with pytest.raises(EchelonError, match="`Agreement` needs more than this sensor"):
+        flown(agreeing(parts=[Choosy(MeanSensor())]))
+
+
 class SearchingSensor(SensorStage):
     """Halves what it reads until it is small: a loop whose end depends on numbers."""
 
