@@ -352,6 +352,40 @@ def test_a_medium_of_your_own_stays_after_a_change_of_the_network(tmp_path):
     assert (np.asarray(swarm.now.memory.network[1].stamp) == NEVER).all()
 
 
+LOUD = """
+import dataclasses
+import numpy as np
+import echelon as ech
+
+
+@dataclasses.dataclass(frozen=True)
+class Lossy(ech.WorldPart):
+    def member(self, loop):
+        none = dataclasses.replace(loop.network.medium, loss=np.asarray(1.0))
+        return loop.with_medium(none)
+"""
+
+
+@pytest.mark.slow
+def test_what_a_part_of_your_own_makes_of_a_medium_stays_after_a_change_of_the_network(tmp_path):
+    (tmp_path / "loud.py").write_text(LOUD)
+    more = {"network": {"rate": 50, "messages": "state"}, "parts": [{"python": "loud.py:Lossy"}]}
+    own = scenario_from_mapping(copy.deepcopy(GIVEN) | more, tmp_path)
+    panel = Panel(own, build(own))
+    swarm = LiveLoop(*panel.experiment, panel.live)
+    swarm.apply(panel.start._replace(loss=0.2))
+    swarm.advance()
+    assert (np.asarray(swarm.now.memory.network[1].stamp) == NEVER).all()
+
+
+@pytest.mark.parametrize("changes", [{"actuator": {"lag": 0.1}}, {"sensing": {"delay": 0.1}}])
+def test_no_first_look_is_at_agents_that_theorems_are_not_about(changes):
+    own = scenario(**changes)
+    panel = Panel(own, build(own))
+    assert panel.live.loop(panel.start) is None
+    assert first_look(panel, panel.start)["short"] == "guarantee \u2026"
+
+
 def test_an_event_of_your_own_does_not_happen_live():
     with pytest.raises(SimulationError, match="the event `far.py:Far` cannot happen live"):
         as_changes([{"at": 1.0, "python": "far.py:Far"}])

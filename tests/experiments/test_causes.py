@@ -24,6 +24,7 @@ from echelon.experiments.scenario.scenario import scenario_from_mapping
 from echelon.experiments.studies import causes as study_of
 from echelon.experiments.studies.causes import Effect, causes, effect_of, moved_starts
 from echelon.experiments.studies.scenario_changes import (
+    candidate_changes,
     other_seed,
     shorter_step,
     without_sections,
@@ -250,10 +251,17 @@ def test_a_shorter_step_keeps_the_wind_and_all_that_is_rounded_to_steps():
             "its gusts would take another course",
         ),
         ({"network": {"rate": 10.0, "jitter": 0.1}}, "its messages would have other delays"),
+        ({"parts": [{"python": "own.py:Own"}]}, "its own parts may count in steps"),
     ],
 )
 def test_a_shorter_step_is_not_tried_where_draws_would_shift(keys, reason):
     assert shorter_step(scenario(**keys)) == reason
+
+
+def test_parts_of_your_own_are_left_out_as_a_change():
+    own = scenario(parts=[{"python": "own.py:Own"}])
+    changes = candidate_changes(own, ech.simulate(*build(scenario())))
+    assert ("parts=null",) in [change.keys for change in changes]
 
 
 def test_another_seed_is_one_of_all_sections():

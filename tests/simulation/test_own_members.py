@@ -1,6 +1,7 @@
 """A user's own sensor, medium, motors and event, of which echelon knows what they say."""
 
 import dataclasses
+import json
 import pathlib
 
 import equinox as eqx
@@ -15,6 +16,7 @@ import echelon as ech
 from echelon.agents.network.channel import Channel
 from echelon.agents.world.sensing import SensorStage
 from echelon.core.errors import EchelonError
+from echelon.guarantees.promises.hypotheses import limits_act, other_limits, trim_line
 from echelon.output.archive.flight_folder import flight_files
 from echelon.simulation.step.motion import IdealMotors
 
@@ -276,6 +278,87 @@ def test_a_part_of_your_own_is_no_subclass_of_echelons():
     with pytest.raises(EchelonError) as caught:
         flown(carts("stopping-point").replace(world=ech.World(network=Distrusted(rate=50.0))))
     assert str(caught.value) == said
+
+
+class Choosy(Sensed):
+    """A sensor that suits no law."""
+
+    def check_laws(self, laws, graph, dt):
+        raise EchelonError(f"`{type(laws.follower).__name__}` needs more than this sensor.")
+
+
+def test_a_part_of_your_own_may_refuse_laws():
+    with pytest.raises(EchelonError, match="`Agreement` needs more than this sensor"):
+        flown(agreeing(parts=[Choosy(MeanSensor())]))
+
+
+class SearchingSensor(SensorStage):
+    """Halves what it reads until it is small: a loop whose end depends on numbers."""
+
+    def read(self, model, memory, x, clock, number):
+        small = jax.lax.while_loop(lambda y: jnp.abs(y).max() > 1e3, lambda y: 0.5 * y, x)
+        return small, memory
+
+
+def test_solvers_that_would_not_read_a_sensor_of_your_own_refuse_it():
+    drive, settings = ech.optimal.RecedingHorizon(), ech.Settings(0.1, DT)
+    parts = agreeing(parts=[Sensed(SlowSensor())]).replace(drive=drive)
+    with pytest.raises(EchelonError, match="got `Sensed`, but `RecedingHorizon` optimizes inputs"):
+        ech.simulate(parts, settings)
+
+
+def test_a_part_of_your_own_without_a_derivative_is_named():
+    sensed = agreeing(parts=[Sensed(MeanSensor()), Sensed(SearchingSensor())])
+    with pytest.raises(EchelonError, match="`Sensed` .*SearchingSensor.* has a loop whose end"):
+        ech.gradient(sensed, ech.Settings(0.1, DT), lambda sums: sums.errors[0].sum(), ["initial"])
+
+
+@dataclasses.dataclass(frozen=True)
+class Noisy(Sensed):
+    """A sensor of the vehicles themselves, which flies, and says all of itself."""
+
+    def unflown(self):
+        return ""
+
+    def simulated(self, plant, dt):
+        return {"noise": plant.per_state({"position": 0.25}).tolist()}
+
+    def received(self, ideal):
+        return (*ideal, "echoes")
+
+    def effects(self):
+        return ech.Effects(limits="the motors stick", rounded=True)
+
+    def off_trim(self, plant, trim):
+        return "the motors stick", "oil them"
+
+
+WIND = ech.Disturbance(rms={"velocity": 0.5}, time=1.0)
+VEHICLES = ech.World(disturbance=WIND, network=ech.Network(rate=50.0), parts=[Noisy(MeanSensor())])
+
+
+def test_what_a_part_of_your_own_says_of_limits_and_information_is_asked():
+    parts, settings = carts("stopping-point").replace(world=VEHICLES), ech.Settings(1.0, DT)
+    assert parts.information.follower[-1] == "echoes"
+    line = trim_line(parts, settings)
+    assert line.fails and (line.text, line.remedy) == ("the motors stick", "oil them")
+    assert limits_act(parts, settings) and other_limits(parts)
+
+
+@pytest.mark.slow
+def test_simulated_vehicles_have_what_a_part_of_your_own_says_of_them():
+    parts, settings = carts("stopping-point").replace(world=VEHICLES), ech.Settings(1.0, DT)
+    vehicles = json.loads(flight_files(parts, settings, "")["flight.json"])["vehicles"]
+    assert vehicles["noise"] == [0.25, 0.25, 0.0, 0.0]
+    assert vehicles["rms"] == [0.0, 0.0, 0.5, 0.5] and vehicles["constant"] == [0.0] * 4
+    assert vehicles["fade"] == pytest.approx(np.exp(-0.5 * DT))
+
+
+def test_noise_on_inputs_is_not_left_out_of_a_flight_in_silence():
+    wind = ech.Disturbance(input_rms={"ax": 0.5})
+    world = ech.World(disturbance=wind, network=ech.Network(rate=50.0))
+    with pytest.raises(EchelonError, match="`disturbance.input_rms` has no counterpart"):
+        flight_files(carts("stopping-point").replace(world=world), ech.Settings(1.0, DT), "")
 
 
 # ---- events --------------------------------------------------------------------------------------

@@ -16,12 +16,18 @@ class Effects(NamedTuple):
         lag: of the actuators, s.
         estimated: whether agents estimate their states.
         other_agents: whether agents move unlike the model.
+        limits: what limits actuators beside the limits of the plant, a phrase.
+        rounded: whether actuators round what they are commanded.
+        age: of messages that arrive, s.
     """
 
     delay: float = 0.0
     lag: float = 0.0
     estimated: bool = False
     other_agents: bool = False
+    limits: str = ""
+    rounded: bool = False
+    age: float = 0.0
 
 
 class WorldPart:
@@ -33,6 +39,8 @@ class WorldPart:
 
     key: str = ""
     """Its section of a scenario; empty for a class of yours."""
+    needs_laws: bool = True
+    """Whether it acts on what laws know or say, so that solvers in their place would ignore it."""
 
     def faults(self, model: ControlAffine, agents: int) -> Iterator[str]:
         """Yield a sentence for each thing that does not fit the model or the number of agents."""
@@ -41,6 +49,13 @@ class WorldPart:
     def remarks(self, model: ControlAffine, horizon: float) -> Iterator[str]:
         """Yield a sentence for what is allowed and probably not meant; the horizon in s."""
         yield from ()
+
+    def check_laws(self, laws: Any, graph: Any, dt: float) -> None:
+        """Raise `EchelonError` unless laws on a graph work with it, at a step dt (s)."""
+
+    def received(self, ideal: tuple[str, ...]) -> tuple[str, ...]:
+        """Return what followers receive of others, in words, from what they would without it."""
+        return ideal
 
     def member(self, loop: Any) -> Any:
         """Return a loop with what runs: other members of its components."""
@@ -62,9 +77,20 @@ class WorldPart:
         """Return what theorems may bound of it."""
         return Effects()
 
+    def off_trim(self, plant: ControlAffine, trim: Array) -> tuple[str, str]:
+        """Return why the actuators of a plant do not deliver a trim input (m,), and a remedy."""
+        return "", ""
+
     def unflown(self) -> str:
         """Return why `echelon fly` refuses it, and what to do; empty where agents fly with it."""
         return "" if self.key else f"`{type(self).__name__}` is not in a flight; leave it out"
+
+    def simulated(self, plant: ControlAffine, dt: float) -> dict[str, Any]:
+        """Return what simulated vehicles have of it in steps dt (s): `constant`, `rms`, `noise`.
+
+        These are lists by state; `fade` is what a step leaves of a gust.
+        """
+        return {}
 
     def words(self, model: ControlAffine) -> str:
         """Return it in words, for data."""

@@ -6,7 +6,7 @@ the others arrive, depends only on the seed, the message's number, its sender an
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple, final
 
 import equinox as eqx
@@ -15,13 +15,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Int
 
-from echelon.agents.part import WorldPart
+from echelon.agents.part import Effects, WorldPart
 from echelon.core.errors import SimulationError, check_kind, is_number
 from echelon.core.numerics import Draw, key_of, uniform
 from echelon.core.types import Array, PyTree
-from echelon.core.words import MessageContent, NeighbourChoice, Prediction
+from echelon.core.words import Feedforward, MessageContent, NeighbourChoice, Prediction
 
 LATE = "messages are late or lost"
+NO_DEVIATIONS = (
+    "the scenario has {}, and agents in processes of their own need messages of deviations; use "
+    "`--set network.messages=deviation --set network.rate=50`"
+)
 _MOST = 2**30
 NEVER = -_MOST
 """The stamp of a message that never came, and the arrival of one that never does: before all steps,
@@ -156,14 +160,66 @@ class Network(WorldPart):
         """Return of what messages theorems are."""
         return "messages that arrive at once"
 
+    def effects(self) -> Effects:
+        """Return how old messages may be that arrive."""
+        return Effects(age=self.delay + self.jitter)
+
+    def check_laws(self, laws: Any, graph: Any, dt: float) -> None:
+        """Raise `EchelonError` if laws need what is late, a plan without one, or a shorter step."""
+        for fault in self._unsuited(laws):
+            raise SimulationError(fault)
+        laws.check_late(graph, dt)
+
+    def _unsuited(self, laws: Any) -> Iterator[str]:
+        word, leader, follower = laws.feedforward, *map(type, (laws.leader, laws.follower))
+        if word in (Feedforward.PARENT, Feedforward.RELAY_VELOCITY):
+            yield (
+                f"`feedforward` of the follower is `{word}`, {word.value}, and a network delivers "
+                "nothing in the same step; use `relay`, which is predicted."
+            )
+        if laws.safety is not None and not self._by_plan:
+            yield (
+                "`safety` over a network needs the messages `deviation` and the prediction "
+                f"`preview`, and got `{self.messages}` and `{self.prediction}`."
+            )
+        if self._by_plan and not laws.plans:
+            yield (
+                "`prediction` of the network is `preview`, and a leader under the law "
+                f"`{leader.__name__}` has no plan; use `packet`."
+            )
+        if self._by_plan and not laws.speak_alike:
+            yield (
+                "`prediction` of the network is `preview`, and followers under the law "
+                f"`{follower.__name__}` do not send what the plan of a leader under "
+                f"`{leader.__name__}` is about; use `packet`."
+            )
+
+    @property
+    def _by_plan(self) -> bool:
+        preview = self.prediction is Prediction.PREVIEW
+        return preview and self.messages is MessageContent.DEVIATION
+
+    def uncovered(self, still: bool) -> tuple[str, str]:
+        """Return why no theorem bounds late messages, and a remedy; `still` of leaders at rest."""
+        if self.loss >= 1.0:
+            return "no message arrives", "set `loss` of the network below 1"
+        if self.messages is MessageContent.STATE:
+            text = "messages contain stopping points that are out of date when they arrive"
+            return text, "set `messages: deviation`"
+        if self.prediction is not Prediction.PREVIEW and not still:
+            text = "without a plan of the leader followers lag behind it"
+            return text, "set `prediction: preview`"
+        return "", ""
+
     def unflown(self) -> str:
-        """Return that a flight has no outages."""
+        """Return that a flight has no outages, and no messages of states."""
+        if self.messages is not MessageContent.DEVIATION:
+            return NO_DEVIATIONS.format("`network.messages` `state`")
         text = "`network.bursts` has no counterpart in a flight; use `network.loss`"
         return text if self.bursts.share else ""
 
     def sentences(self, result: Any) -> str:
         """Return what a report says of it."""
-        whole = self.messages is MessageContent.DEVIATION and self.prediction is Prediction.PREVIEW
         known = " Every agent knows the leader's whole plan before the start. "
         known += "Messages only carry deviations from it, so few are needed."
         traffic, messages = result.traffic, ""
@@ -174,7 +230,7 @@ class Network(WorldPart):
                 messages += f"; those in use were {1e3 * traffic.mean:.3g} ms old on average and "
                 messages += f"{1e3 * traffic.largest:.4g} ms at most"
             messages += "."
-        return f"Network: {self}." + known * whole + messages
+        return f"Network: {self}." + known * self._by_plan + messages
 
     def variables(self, result: Any) -> dict[str, Any]:
         """Return the ages of messages and which were lost, of each frame, link and end."""
@@ -190,13 +246,12 @@ class Network(WorldPart):
             "forget": ((), self.forget, seconds),
         }
 
-    @property
-    def information(self) -> str:
-        """What each agent receives, in words."""
+    def received(self, ideal: tuple[str, ...]) -> tuple[str, ...]:
+        """Return what each follower receives, in words."""
         if self.messages is MessageContent.STATE:
-            return "neighbours' signals and the feed-forward of the leader, all late"
+            return ("neighbours' signals and the feed-forward of the leader, all late",)
         leader = _LEADERS[self.prediction]
-        return f"neighbours' deviations from where they expect the leader; {leader}; all late"
+        return (f"neighbours' deviations from where they expect the leader; {leader}; all late",)
 
     def __str__(self) -> str:
         parts = [f"{self.rate:g} Hz", f"delay {1e3 * self.delay:g} ms"]

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.part import Effects, WorldPart
 from echelon.core.errors import SimulationError, is_number
+from echelon.core.numerics import precision
 from echelon.core.types import Array, Input
 
 _SETTLES = 3.0
@@ -36,7 +37,7 @@ class Actuator(WorldPart):
         SimulationError: a number is out of its range.
     """
 
-    key = "actuator"
+    key, needs_laws = "actuator", False
 
     lag: float = 0.0
     levels: int = 0
@@ -75,8 +76,20 @@ class Actuator(WorldPart):
         return "inputs that act at once" if self.lag or self.levels else ""
 
     def effects(self) -> Effects:
-        """Return the lag."""
-        return Effects(lag=self.lag)
+        """Return the lag, that motors have a least thrust, and that they have levels."""
+        limits = "" if self.minimum is None else "the motors have a least thrust"
+        return Effects(lag=self.lag, limits=limits, rounded=bool(self.levels))
+
+    def off_trim(self, plant: ControlAffine, trim: Array) -> tuple[str, str]:
+        """Return that the least thrust of a motor is more than its share of the trim input."""
+        if self.minimum is None:
+            return "", ""
+        with precision("float64"):
+            motors = dataclasses.replace(self, levels=0).prepared(plant)
+            given = trim if motors is None else np.asarray(motors.command(jnp.asarray(trim)))
+        if np.allclose(given, trim, rtol=1e-9, atol=1e-9 * float(np.abs(trim).max())):
+            return "", ""
+        return "the motors' `minimum` is more than the trim needs", "lower `minimum`"
 
     def sentences(self, result: Any) -> str:
         """Return what a report says of it."""

@@ -48,7 +48,7 @@ class Disturbance(WorldPart):
         SimulationError: a number is not finite, an rms is negative, or `hold` is not positive.
     """
 
-    key = "disturbance"
+    key, needs_laws = "disturbance", False
 
     constant: Mapping[str, float] = dataclasses.field(default_factory=dict)
     rms: Mapping[str, float] = dataclasses.field(default_factory=dict)
@@ -112,6 +112,16 @@ class Disturbance(WorldPart):
     def presumed(self) -> str:
         """Return nothing: agents in wind are the same agents."""
         return ""
+
+    def unflown(self) -> str:
+        """Return that simulated vehicles have no noise on their inputs."""
+        text = "`disturbance.input_rms` has no counterpart in a flight; leave it out"
+        return text if any(self.input_rms.values()) else ""
+
+    def simulated(self, plant: ControlAffine, dt: float) -> dict[str, Any]:
+        """Return the push on each state, and its gusts."""
+        constant, rms = (plant.per_state(x).tolist() for x in (self.constant, self.rms))
+        return {"constant": constant, "rms": rms, "fade": math.exp(-dt / (self.time or self.hold))}
 
     def sentences(self, result: Any) -> str:
         """Return what a report says of it."""

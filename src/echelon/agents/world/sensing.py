@@ -211,6 +211,10 @@ class Sensing(WorldPart):
         text = "`sensing.delay` has no counterpart in a flight; leave it out"
         return text if self.delay else ""
 
+    def simulated(self, plant: ControlAffine, dt: float) -> dict[str, Any]:
+        """Return the noise of each state."""
+        return {"noise": plant.per_state(self.noise).tolist()}
+
     def sentences(self, result: Any) -> str:
         """Return what a report says of it."""
         return f"Sensing of own states: {self}."

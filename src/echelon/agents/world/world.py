@@ -14,13 +14,7 @@ from echelon.agents.part import Effects, WorldPart
 from echelon.agents.world.actuator import Actuator
 from echelon.agents.world.disturbance import Disturbance
 from echelon.agents.world.sensing import Sensing
-from echelon.core.errors import (
-    ModelError,
-    SimulationError,
-    check_kind,
-    did_you_mean,
-    listing,
-)
+from echelon.core.errors import ModelError, SimulationError, check_kind, did_you_mean, listing
 
 
 def vary_parameters(
@@ -118,7 +112,7 @@ def _format_value(value: Any) -> str:
 class Plants(WorldPart):
     """Agents that move unlike the model: the plant of all, and those of single agents."""
 
-    key = "plant"
+    key, needs_laws = "plant", False
 
     plant: ControlAffine | None
     plants: Mapping[int, ControlAffine]
@@ -217,10 +211,9 @@ class World:
     @property
     def effects(self) -> Effects:
         """What theorems may bound of all parts."""
-        each = [part.effects() for part in self.all_parts]
-        delay, lag = (sum(getattr(x, name) for x in each) for name in ("delay", "lag"))
-        estimated, other = (any(getattr(x, name) for x in each) for name in Effects._fields[2:])
-        return Effects(delay, lag, estimated, other)
+        columns = zip(Effects(), *(part.effects() for part in self.all_parts), strict=True)
+        joined: Any = [sum(x) if isinstance(x[0], float) else max(x) for x in columns]
+        return Effects(*joined)
 
     def plant_for(self, model: ControlAffine) -> ControlAffine:
         """Return the plant, or the model if there is none."""
@@ -233,12 +226,7 @@ class World:
             ModelError: the plant is malformed, or has other states or inputs than the model.
             SimulationError: a part is of another kind.
         """
-        kinds = {
-            "disturbance": Disturbance,
-            "network": Network,
-            "actuator": Actuator,
-            "sensing": Sensing,
-        }
+        kinds = dict(disturbance=Disturbance, network=Network, actuator=Actuator, sensing=Sensing)
         named = [(name, getattr(self, name), kind) for name, kind in kinds.items()]
         if not isinstance(self.parts, Sequence):
             kind = type(self.parts).__name__

@@ -226,14 +226,14 @@ class LiveParts:
         """Return the closed loop near the trim, as a guarantee judges it.
 
         None without a gain, on a switching graph, whose modes are not those of one matrix, after
-        events, and with late messages.
+        events, and in a world whose agents are others than those that theorems are about.
 
         Raises:
             GraphError: the cut links disconnect the graph.
         """
         gain, parts = self.gain(knobs), self.parts
         switches = parts.graph.schedule is not None or knobs.events
-        if gain is None or switches or parts.drive.unknown or parts.world.network is not None:
+        if gain is None or switches or parts.drive.unknown or parts.world.presumed:
             return None
         gain = eqx.tree_at(lambda gain: gain.coupling, gain, knobs.coupling)
         assert isinstance(parts.drive, Laws)

@@ -16,7 +16,6 @@ from echelon.agents.network.channel import NEVER, Channel
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.hearing import edges_of
 from echelon.agents.world.disturbance import Disturbance
-from echelon.agents.world.sensing import NoisySensor, Sensors
 from echelon.apps.live.attendance import attendance, room_for_events
 from echelon.apps.live.knobs import Knobs, LiveParts
 from echelon.core.compiled import cached_jit
@@ -130,7 +129,9 @@ class LiveLoop:
         problem, drive = prepared.problem, prepared.parts.drive
         assert isinstance(drive, Laws)
         with precision("float64"):
-            loop = assemble(problem, drive.leader, drive.follower)
+            # Checked with the members of a user's parts, which come after all that knobs change.
+            assemble(problem, drive.leader, drive.follower)
+            loop = assemble(problem._replace(parts=()), drive.leader, drive.follower)
         law = loop.laws.follower
         gain = panel.gain(panel.start)
         if gain is not None:
@@ -141,13 +142,12 @@ class LiveLoop:
         # The share of the feed-forward is a number of the loop, so that a knob can change it.
         part = FeedforwardFraction(np.asarray(1.0))
         laws = dataclasses.replace(loop.laws, follower=law, feedforward=part)
-        self.loop: Loop = loop.replace(laws=laws)
-        self.sensing = loop.sensing
         self.panel, self.settings, self.parts = panel, settings, prepared.parts
         self.warnings = prepared.warnings
         self.eventful = eventful
-        if isinstance(loop.network, LateNetwork):
-            self.loop = self.loop.with_medium(self._roomy(loop.network.medium))
+        self.noisy = [k for k, stage in enumerate(loop.sensing.stages) if stage.random]
+        self.noises = self._noises(loop)
+        self.plain: Loop = self._with_network(loop.replace(laws=laws), panel.start)
         self.potentials: dict[Hashable, Callable[[Array], Array]] = {}
         self.states, self.first = problem.states, 0
         self.measured = list(problem.meter.measured)
@@ -161,9 +161,10 @@ class LiveLoop:
         self.ahead = range(0)
         self._look_ahead(0)
         self._count(panel.start)
+        self.loop = self._whole(self.plain)
         # Other in all numbers that knobs change, except for weights.
-        other = (np.full(np.shape(leaf), np.nan) for leaf in self._changing(self.loop))
-        unlike = eqx.tree_at(self._changing, self.loop, tuple(other))
+        other = (np.full(np.shape(leaf), np.nan) for leaf in self._changing(self.plain))
+        unlike = self._whole(eqx.tree_at(self._changing, self.plain, tuple(other)))
         engine = choose_stepper(self.loop, unlike, self.states, settings)
         self.stepper = engine.stepper
         self.precision: Precision = engine.precision
@@ -182,10 +183,19 @@ class LiveLoop:
 
     def _changing(self, loop: Loop) -> tuple[PyTree, ...]:
         """Return all numbers that knobs change, except for places and weights."""
-        noisy = (k for k, one in enumerate(self.sensing.stages) if isinstance(one, NoisySensor))
-        noise: Any = (loop.sensing.stages[k] for k in noisy)
-        wind = loop.motion.weather[0].constant
-        return (*self._adjustable(loop), wind, *(stage.std for stage in noise))
+        return (*self._adjustable(loop), loop.motion.weather[0].constant, *self._noises(loop))
+
+    def _noises(self, loop: Loop) -> tuple[Array, ...]:
+        """Return the deviations of the noise of each stage of the sensing that has one."""
+        stages: Any = loop.sensing.stages
+        return tuple(stages[k].std for k in self.noisy)
+
+    def _whole(self, plain: Loop) -> Loop:
+        """Return a loop with the members of a user's parts, as echelon's own are now."""
+        with precision("float64"):
+            for part in self.parts.world.parts:
+                plain = part.member(plain)
+        return plain
 
     def _look_ahead(self, step: int) -> None:
         schedule, dt = self.parts.graph.schedule, self.settings.dt
@@ -194,10 +204,10 @@ class LiveLoop:
         first = max(0, int(step * dt / schedule.period) - 1)
         horizon = max(_AHEAD, 4.0 * schedule.period)
         switches = Switches(*schedule.switches(dt, horizon, first))
-        loop = self.loop.replace(graph=dataclasses.replace(self.loop.graph, switches=switches))
+        loop = self.plain.replace(graph=dataclasses.replace(self.plain.graph, switches=switches))
         if loop.roster.changes:
             loop = loop.replace(roster=dataclasses.replace(loop.roster, switches=switches))
-        self.loop = loop
+        self.plain, self.loop = loop, self._whole(loop)
         # A whole period before the end: a picture that begins in this range also ends in it.
         last = int(first + horizon / schedule.period) * schedule.period
         self.ahead = range(int(switches.steps[0]), int(last / dt) - self.count)
@@ -273,27 +283,26 @@ class LiveLoop:
         weights = self.weights.copy()
         weights[..., np.isin(self.edge, list(knobs.cut))] = 0.0
         loop = eqx.tree_at(
-            lambda loop: (
-                loop.places.offsets,
-                loop.graph.exchange.weights,
-                loop.motion.weather[0].constant,
-            ),
-            self.loop,
-            (self.offsets, weights, self.panel.wind(knobs)),
+            lambda loop: (loop.places.offsets, loop.graph.exchange.weights),
+            self.plain,
+            (self.offsets, weights),
         )
-        self.loop = self._in_world(eqx.tree_at(self._adjustable, loop, self._numbers(knobs)), knobs)
-        places = self.loop.places
+        noises = (knobs.noise * std for std in self.noises)
+        numbers = *self._numbers(knobs), self.panel.wind(knobs), *noises
+        loop = self._with_network(eqx.tree_at(self._changing, loop, numbers), knobs)
+        places = loop.places
         if isinstance(places, MovingPlaces):
             moving = self.panel.motion(knobs, places.motion)
             assert moving is not None
-            self.loop = self.loop.replace(places=MovingPlaces(places.offsets, moving))
+            loop = loop.replace(places=MovingPlaces(places.offsets, moving))
+        self.plain, self.loop = loop, self._whole(loop)
 
     def _count(self, knobs: Knobs) -> None:
-        if not self.loop.roster.changes:
+        if not self.plain.roster.changes:
             return
-        law, graph = self.loop.laws.follower, self.parts.graph
+        law, graph = self.plain.laws.follower, self.parts.graph
         now = attendance(graph, knobs.events, law.leaderward, self.settings.dt)
-        self.loop, self.weights = now.put_into(self.loop), now.weights
+        self.plain, self.weights = now.put_into(self.plain), now.weights
         self.here, self.nearest = now.present[-1], now.nearest[-1]
 
     def _roomy(self, channel: Channel) -> Channel:
@@ -302,21 +311,12 @@ class LiveLoop:
         steps = math.ceil(most / self.settings.dt) + int(channel.jitter) + 1
         return dataclasses.replace(channel, slots=steps // int(channel.every) + 2, bursty=True)
 
-    def _in_world(self, loop: Loop, knobs: Knobs) -> Loop:
+    def _with_network(self, loop: Loop, knobs: Knobs) -> Loop:
         network, settings = self.panel.network(knobs), self.settings
-        if network is not None:
-            channel = network.prepared(settings.dt, math.inf, settings.seed)
-            # A medium of a user's own remains one.
-            medium: Any = getattr(loop.network, "medium", channel)
-            channel = dataclasses.replace(medium, **vars(channel))
-            loop = loop.with_medium(self._roomy(channel))
-        stages = tuple(
-            dataclasses.replace(stage, std=knobs.noise * first.std)
-            if isinstance(stage, NoisySensor) and isinstance(first, NoisySensor)
-            else stage
-            for stage, first in zip(loop.sensing.stages, self.sensing.stages, strict=True)
-        )
-        return loop.replace(sensing=Sensors(stages))
+        if network is None:
+            return loop
+        channel = network.prepared(settings.dt, math.inf, settings.seed)
+        return loop.with_medium(self._roomy(channel))
 
     def _numbers(self, knobs: Knobs) -> tuple[PyTree, ...]:
         share, gain = np.asarray(float(knobs.feedforward)), self.panel.gain(knobs)

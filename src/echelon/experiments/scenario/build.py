@@ -240,8 +240,9 @@ class _Builder:
             laws.check_backups(parts.graph)
             if leadership is not None:
                 leadership.check_network(world.network)
-        with self.at("network"):
-            laws.check_world(world, parts.graph, scenario.simulation.dt)
+        for part in world.all_parts:
+            with self.at(part.key or "parts"):
+                part.check_laws(laws, parts.graph, scenario.simulation.dt)
         with self.at("initial"):
             initial_states(parts, scenario.seed)
         self.settle()

@@ -68,6 +68,7 @@ _REMOVALS = (
     _Removal(("actuator", "minimum"), "null", "no least thrust"),
     _Removal(("disturbance",), "null", "no disturbance", remedy=False),
     _Removal(("plant",), "null", "agents equal to the model", remedy=False),
+    _Removal(("parts",), "null", "no parts of your own", remedy=False),
     _Removal(("events",), "[]", "no events", remedy=False),
     _Removal(("safety",), "null", "no collision avoidance"),
     _Removal(("formation", "motion"), "[]", "a formation that does not move"),
@@ -166,6 +167,8 @@ def shorter_step(scenario: Scenario) -> tuple[str, ...] | str:
         return "its gusts would take another course"
     if network is not None and network.jitter:
         return "its messages would have other delays"
+    if scenario.parts:
+        return "its own parts may count in steps"
     keys = [f"simulation.dt={dt / 2!r}", f"simulation.store_every={2 * simulation.store_every}"]
     if wind is not None and (wind.rms or wind.input_rms):
         keys.append(f"disturbance.hold={max(1, round(wind.hold / dt)) * dt!r}")

@@ -33,7 +33,7 @@ def local_lines(
     yield _decays(parts, settings, local, shorter)
     yield _held(parts, settings, local)
     yield from _switches(parts, local)
-    yield from _messages(parts, local)
+    yield from _messages(local)
 
 
 def _repeats(parts: Parts, local: LocalCertificate) -> Statement:
@@ -230,9 +230,9 @@ def _switches(parts: Parts, local: LocalCertificate) -> Iterator[Statement]:
     yield fails(name, _LINEAR, text, *number, remedy=remedy, reason=text)
 
 
-def _messages(parts: Parts, local: LocalCertificate) -> Iterator[Statement]:
+def _messages(local: LocalCertificate) -> Iterator[Statement]:
     """Yield of which ages of messages the modes are; nothing of the ideal network."""
-    if parts.world.network is None or local.radius is None or local.steady:
+    if local.radius is None or local.steady:
         return
     text = "messages are lost or late by chance, and modes are known of messages of one age alone"
     remedy = "leave out `loss`, `jitter` and `bursts` to see them"

@@ -347,7 +347,8 @@ def late_messages_of(
     """Return what T9 says of a run over a network, or why nothing; None for the ideal network."""
     if network is None:
         return None
-    obstacle = _uncovered(network, following)
+    text, remedy = network.uncovered(following.still)
+    obstacle = Uncovered(text, remedy, True) if text else _beyond(following)
     if obstacle is not None:
         return obstacle
     graph, c = following.graph, following.coupling
@@ -396,15 +397,7 @@ _UNPROVED = Uncovered(
 )
 
 
-def _uncovered(network: Network, following: Following) -> Uncovered | None:
-    if network.loss >= 1.0:
-        return Uncovered("no message arrives", "set `loss` of the network below 1", True)
-    if network.messages is MessageContent.STATE:
-        text = "messages contain stopping points that are out of date when they arrive"
-        return Uncovered(text, "set `messages: deviation`", True)
-    if network.prediction is not Prediction.PREVIEW and not following.still:
-        text = "without a plan of the leader followers lag behind it"
-        return Uncovered(text, "set `prediction: preview`", True)
+def _beyond(following: Following) -> Uncovered | None:
     if following.apart:
         return Uncovered("the leaders start apart", "start the leaders alike", False)
     if following.avoiding:

@@ -3,12 +3,10 @@
 A failed line with a `reason` rules out any guarantee; without one it weakens or explains it.
 """
 
-import dataclasses
 import math
 from collections.abc import Iterator
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.models.linearization import at_trim
@@ -17,7 +15,6 @@ from echelon.agents.models.model_check import Shortfall, at_limits, is_limited, 
 from echelon.agents.models.relative_equilibrium import trim_speed, trim_velocity
 from echelon.agents.network.graph import Graph
 from echelon.agents.part import Event
-from echelon.agents.world.actuator import Actuator
 from echelon.core.compiled import compiled_for_one_call
 from echelon.core.digits import about, at_least
 from echelon.core.errors import listing
@@ -109,8 +106,8 @@ def trim_line(parts: Parts, settings: Settings) -> Statement:
     model, world, name = parts.model, parts.world, Hypothesis.TRIM_WITHIN_LIMITS
     plants = (world.plant_for(model), *world.plants.values())
     trim = np.asarray(model.trim[1], float)
-    if any(_forced_off_trim(world.actuator, plant, trim) for plant in plants):
-        text, remedy = "the motors' `minimum` is more than the trim needs", "lower `minimum`"
+    asked = (part.off_trim(plant, trim) for part in world.all_parts for plant in plants)
+    for text, remedy in filter(any, asked):
         return fails(name, Kind.PROOF, text, remedy=remedy, reason=f"{text}: no agent holds it")
     if not (settings.limits and any(map(is_limited, plants))):
         return unneeded(name, Kind.PROOF, "the inputs have no limits")
@@ -135,16 +132,6 @@ def trim_line(parts: Parts, settings: Settings) -> Statement:
     remedy = "lighten the agents or strengthen their actuators"
     number, reason = (worst, f"{about(100.0 * worst)} %"), f"{text}, and cannot hold the trim"
     return fails(name, Kind.PROOF, text, *number, remedy=remedy, reason=reason)
-
-
-def _forced_off_trim(actuator: Actuator | None, plant: ControlAffine, trim: Array) -> bool:
-    """Tell whether the least thrust of a motor is more than its share of the trim input (m,)."""
-    if actuator is None or actuator.minimum is None:
-        return False
-    with precision("float64"):
-        motors = dataclasses.replace(actuator, levels=0).prepared(plant)
-        given = trim if motors is None else np.asarray(motors.command(jnp.asarray(trim)))
-    return not np.allclose(given, trim, rtol=1e-9, atol=1e-9 * float(np.abs(trim).max()))
 
 
 def _exact(case: GuaranteeInputs) -> Statement:
@@ -350,19 +337,18 @@ def _through(graph: Graph, event: Event, guarantee: Guarantee) -> JsonObject:
 
 
 def limits_act(parts: Parts, settings: Settings) -> bool:
-    """Tell whether an input of an agent may be at a limit, or at the least thrust of a motor."""
-    world, model, actuator = parts.world, parts.model, parts.world.actuator
-    if actuator is not None and actuator.minimum is not None:
+    """Tell whether an input of an agent may be at a limit, or at one that a part adds."""
+    world, model = parts.world, parts.model
+    if world.effects.limits:
         return True
     plants = model, world.plant_for(model), *world.plants.values()
     return settings.limits and any(map(is_limited, plants))
 
 
 def other_limits(parts: Parts) -> bool:
-    """Tell whether an agent has other limits than the model, or motors with a minimum."""
+    """Tell whether an agent has other limits than the model, or actuators that round."""
     world, model = parts.world, parts.model
-    actuator = world.actuator
-    if actuator is not None and (actuator.levels or actuator.minimum is not None):
+    if world.effects.limits or world.effects.rounded:
         return True
     plants = {id(x): x for x in (world.plant_for(model), *world.plants.values())}
     own = type(model).limit, digest(model.input_limits)

@@ -88,11 +88,10 @@ def from_starts(line: Statement, starts: Statement) -> Statement:
 
 def _unbounded(parts: Parts, leaders: Leaders, region: RegionCertificate) -> str:
     """Return why rows of limits say nothing of a set; empty where they do."""
-    actuator = parts.world.actuator
     if is_by_user(parts.model, "limit"):
         return f"`{type(parts.model).__name__}` has a `limit` of its own, which no rows describe"
-    if actuator is not None and actuator.minimum is not None:
-        return "the motors have a least thrust"
+    if parts.world.effects.limits:
+        return parts.world.effects.limits
     if leaders.answer:
         return "the leader reacts to followers, and its inputs depend on them"
     if not has_constant_input_map(parts.model, region.domain) and region.theorem is not Theorem.T2:

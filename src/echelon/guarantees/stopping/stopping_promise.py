@@ -172,7 +172,7 @@ def _known_lines(
 
 def _own_line(run: StoppingRun, problem: Problem) -> Statement | None:
     parts, law, network = run.parts, run.law, run.network
-    if parts.graph.schedule is not None or network is None and parts.world.network is not None:
+    if parts.graph.schedule is not None or run.late is not network:
         # What is known of the ideal network is not true of one that no theorem covers.
         return None
     heard, between = None, False

@@ -1,8 +1,10 @@
 """What flies: the folder of one agent's law, as Python and C, and that of a whole flight."""
 
+import functools
 import hashlib
 import json
 import math
+import operator
 import py_compile
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,13 +16,13 @@ from echelon import __version__
 from echelon.agents.models.heading_symmetry import heading_index
 from echelon.agents.models.linearization import own_damping
 from echelon.agents.models.model import ControlAffine
-from echelon.agents.network.channel import Network
+from echelon.agents.network.channel import NO_DEVIATIONS, Network
 from echelon.core.errors import FlightError, OutputError
 from echelon.core.files import write_atomic
 from echelon.core.numerics import precision
 from echelon.core.trace import shared_traces
 from echelon.core.types import Array, JsonObject
-from echelon.core.words import MessageContent, Verdict
+from echelon.core.words import Verdict
 from echelon.guarantees.promises.coverage import watched_by
 from echelon.guarantees.promises.promise import guarantee_data
 from echelon.laws.law import Travels
@@ -236,12 +238,8 @@ def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, 
 
 def _network(parts: Parts) -> Network:
     network = parts.world.network
-    if network is None or network.messages is not MessageContent.DEVIATION:
-        got = "no `network`" if network is None else "`network.messages` `state`"
-        raise FlightError(
-            f"the scenario has {got}, and agents in processes of their own need messages of "
-            "deviations; use `--set network.messages=deviation --set network.rate=50`."
-        )
+    if network is None:
+        raise FlightError(f"{NO_DEVIATIONS.format('no `network`')}.")
     if not isinstance(parts.drive, Laws):
         raise FlightError("the agents of the scenario are under no laws, and only laws can fly.")
     if parts.events:
@@ -331,14 +329,10 @@ def _vehicles(parts: Parts, settings: Settings) -> tuple[JsonObject, dict[str, s
         raise OutputError(f"the vehicles have no code for {error}.") from None
     names = [f"vehicle-{texts.index(text)}.py" for text in texts]
     trim_x, trim_u = (list(map(float, part)) for part in motion.plant.trim)
-    lags, disturbance, sensing = (
-        motion.motors.remembers,
-        parts.world.disturbance,
-        parts.world.sensing,
-    )
-    wind = next(iter(motion.weather), None)
-    zeros = [0.0] * len(trim_x)
-    time = disturbance and (disturbance.time or disturbance.hold)
+    still = dict.fromkeys(("constant", "rms", "noise"), [0.0] * len(trim_x))
+    simulated = [
+        part.simulated(motion.plant, settings.dt / _SUBSTEPS) for part in parts.world.all_parts
+    ]
     facts = {
         "starts": np.asarray(prepared.problem.states).tolist(),
         "files": names,
@@ -347,12 +341,10 @@ def _vehicles(parts: Parts, settings: Settings) -> tuple[JsonObject, dict[str, s
         "trim": hover,
         "rest": trim_x,
         **_autopilot(model, trim_x),
-        "memory": trim_u if lags else [],
-        "constant": zeros if wind is None else np.asarray(wind.constant).tolist(),
-        "rms": zeros if wind is None or wind.rms is None else np.asarray(wind.rms).tolist(),
-        "fade": math.exp(-settings.dt / _SUBSTEPS / time) if time else 0.0,
-        "noise": zeros if sensing is None else model.per_state(sensing.noise).tolist(),
+        "memory": trim_u if motion.motors.remembers else [],
+        "fade": 0.0,
         "seed": settings.seed,
+        **functools.reduce(operator.or_, simulated, still),
     }
     return facts, dict(zip(names, texts, strict=True))
 

@@ -135,16 +135,15 @@ class Agent:
                 f"agent {agent!r} is not in this graph, whose agents are 0 to "
                 f"{parts.graph.agents - 1}."
             )
-        network, sensing = parts.world.network, parts.world.sensing
-        late = max(network.delay, network.jitter) if network else 0.0
-        late = max([late, sensing.delay if sensing else 0.0, *(e.at for e in parts.events)])
+        effects = parts.world.effects
+        late = max([effects.delay, effects.age, *(event.at for event in parts.events)])
         horizon = dt * math.ceil(1.0 + late / dt)
         prepared = prepare(parts, Settings(horizon=horizon, dt=dt, limits=limits))
         drive = prepared.parts.drive
         assert isinstance(drive, Laws)
         with precision("float64"):
             loop = assemble(prepared.problem, drive.leader, drive.follower)
-        if loop.laws.backups and network is None:
+        if loop.laws.backups and not loop.network.late:
             raise SimulationError(
                 "got `leadership` without a network, in which single agents know at once who "
                 "leads; give the parts' world a `network`."

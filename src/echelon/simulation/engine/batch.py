@@ -211,10 +211,8 @@ def _job(case: _SharedRun, place: int, settings: Settings, states: Array) -> _Ba
     if not world.ideal:
         # Draws of a seed of its own.
         motion = PlantStep.of(problem.model, world, settings, len(states))
-        channel, sensors = (
-            channel_of(prepared.parts, settings),
-            sensors_of(prepared.parts, settings),
-        )
+        channel = channel_of(prepared.parts, settings)
+        sensors = sensors_of(prepared.parts, settings)
         problem = problem._replace(motion=motion, channel=channel, sensors=sensors)
         loop = loop.replace(motion=motion, sensing=sensors)
         loop = loop if channel is None else loop.with_medium(channel)

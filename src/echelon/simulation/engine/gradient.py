@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import SimulationError, check_name
@@ -24,7 +25,7 @@ from echelon.simulation.step.drive import Controller, Problem
 from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.meter import Sums
 from echelon.simulation.step.records import LoopState
-from echelon.simulation.step.sequence import begin, measured_step
+from echelon.simulation.step.sequence import begin, measured_step, step
 from echelon.simulation.step.settings import Settings
 
 Cost: TypeAlias = Callable[[Sums], jax.Array]
@@ -91,14 +92,34 @@ def gradient(parts: Parts, settings: Settings, cost: Cost, wrt: Sequence[str]) -
         except ValueError as error:
             if "Reverse-mode" not in str(error):
                 raise
-            raise SimulationError(
-                "the steps have a loop whose end depends on numbers, as `safety` has and "
-                "`prediction: packet` of states, and JAX has no derivative of it."
-            ) from error
+            raise SimulationError(_searching(problem, drive)) from error
     by_variable = {name: np.asarray(slope) for name, slope in slopes.items()}
     for name in {"P", "R"} & by_variable.keys():
         by_variable[name] = 0.5 * (by_variable[name] + by_variable[name].T)
     return Gradient(float(value), by_variable, jax.tree.map(np.asarray, sums))
+
+
+def _searching(problem: Problem, drive: Laws) -> str:
+    """Return that steps have no derivative, and since which part of a user's own."""
+    parts = problem.parts
+    first = (problem._replace(parts=parts[:k]) for k in range(1 + len(parts)))
+    k = next((len(each.parts) for each in first if not _has_derivative(each, drive)), 0)
+    whose = f"{parts[k - 1].words(problem.model)} has" if k else "the steps have"
+    like = ", as `safety` has and `prediction: packet` of states" * (not k)
+    return f"{whose} a loop whose end depends on numbers{like}, and JAX has no derivative of it."
+
+
+def _has_derivative(problem: Problem, drive: Laws) -> bool:
+    loop = assemble(problem, drive.leader, drive.follower)
+
+    def stepped(states: jax.Array) -> jax.Array:
+        return ravel_pytree(step(loop, begin(loop, states)))[0].sum()
+
+    try:
+        jax.eval_shape(jax.grad(stepped), jnp.asarray(problem.states))
+    except ValueError:
+        return False
+    return True
 
 
 def _values_of(problem: Problem, drive: Controller, wrt: Sequence[str]) -> dict[str, Array]:

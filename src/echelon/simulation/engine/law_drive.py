@@ -20,7 +20,7 @@ from echelon.core.errors import (
 from echelon.core.identity import process_key
 from echelon.core.numerics import precision
 from echelon.core.types import Array, Scalar, State
-from echelon.core.words import Feedforward, Frame, MessageContent, Prediction
+from echelon.core.words import Feedforward, Frame
 from echelon.laws.flat_law import FlatLaw
 from echelon.laws.flat_loop import FlatMemory
 from echelon.laws.integral_check import check_sums
@@ -127,41 +127,27 @@ class Laws(Controller):
         return self if same or key is not None and key == process_key(self) else drive
 
     def check_world(self, world: World, graph: Graph, dt: float) -> None:
-        """Check that both laws work with messages that are late.
+        """Check that both laws work with all parts of a world.
 
         Raises:
-            EchelonError: a follower needs others' inputs of the same step, the leader has no plan,
-                or a step is too long for the coupling.
+            EchelonError: a part does not suit them, such as a network of late messages.
         """
-        network = world.network
-        if network is None:
-            return
-        word = self.follower.feedforward
-        if word in (Feedforward.PARENT, Feedforward.RELAY_VELOCITY):
-            raise SimulationError(
-                f"`feedforward` of the follower is `{word}`, {word.value}, and a network delivers "
-                "nothing in the same step; use `relay`, which is predicted."
-            )
-        preview = network.prediction is Prediction.PREVIEW
-        deviations = network.messages is MessageContent.DEVIATION
-        if self.safety is not None and not (deviations and preview):
-            raise SimulationError(
-                "`safety` over a network needs the messages `deviation` and the prediction "
-                f"`preview`, and got `{network.messages}` and `{network.prediction}`."
-            )
-        if deviations and preview and not Travels.of(self.leader).plans:
-            raise SimulationError(
-                f"`prediction` of the network is `preview`, and a leader under the law "
-                f"`{type(self.leader).__name__}` has no plan; use `packet`."
-            )
-        follower, leader = (Speaks.may(x, "signal") for x in (self.follower, self.leader))
-        if deviations and preview and follower is not leader:
-            raise SimulationError(
-                f"`prediction` of the network is `preview`, and followers under the law "
-                f"`{type(self.follower).__name__}` do not send what the plan of a leader under "
-                f"`{type(self.leader).__name__}` is about; use `packet`."
-            )
+        for part in world.all_parts:
+            part.check_laws(self, graph, dt)
+
+    def check_late(self, graph: Graph, dt: float) -> None:
+        """Raise `LawError` if a step dt (s) is too long for late messages."""
         Checks.of(self.follower).check_late(graph, dt)
+
+    @property
+    def plans(self) -> bool:
+        """Whether leaders have a plan."""
+        return Travels.of(self.leader).plans
+
+    @property
+    def speak_alike(self) -> bool:
+        """Whether leaders and followers both say a signal, or both a state."""
+        return Speaks.may(self.leader, "signal") is Speaks.may(self.follower, "signal")
 
     @property
     def lags(self) -> bool:
@@ -198,7 +184,7 @@ class Laws(Controller):
         if not graph.backups:
             return
         name = f"`{type(self.leader).__name__}`"
-        if not Travels.of(self.leader).plans:
+        if not self.plans:
             raise SimulationError(
                 f"got `backups`, but a leader under the law {name} has no plan that they could "
                 "carry on; give it a `reference`."

@@ -139,10 +139,11 @@ class Parts:
 
     @property
     def information(self) -> Information:
-        """What leaders and followers receive from others, over the network that there is."""
-        ideal = self.drive.information_for(self.model, self.graph)
-        network = self.world.network
-        return ideal if network is None else ideal._replace(follower=(network.information,))
+        """What leaders and followers receive from others, in the world that there is."""
+        known = self.drive.information_for(self.model, self.graph)
+        for part in self.world.all_parts:
+            known = known._replace(follower=part.received(known.follower))
+        return known
 
     @property
     def leaderward(self) -> bool:

@@ -242,8 +242,9 @@ class Controller(Declared):
 
     def check_world(self, world: World, graph: Graph, dt: float) -> None:
         """Raise `EchelonError` unless a world suits the drive at a step dt (s)."""
-        for name in ("network", "sensing"):
-            if getattr(world, name) is not None:
+        for part in world.all_parts:
+            if part.needs_laws:
+                name = part.key or type(part).__name__
                 raise SimulationError(
                     f"got `{name}`, but `{type(self).__name__}` optimizes inputs from exact states "
                     f"that arrive at once; use control laws, or remove `{name}`."
