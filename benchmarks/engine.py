@@ -36,8 +36,9 @@ except ImportError:
 from steppers import FORMATIONS, STEPS, Yardstick, flock, rate
 
 import echelon as ech
-from echelon.simulation.codegen import Code, program
+from echelon.simulation.codegen import Code
 from echelon.simulation.engine.batch import Batch
+from echelon.simulation.engine.jax_stepper import JaxFormations
 from echelon.simulation.native.kernel_cache import Kernels
 from echelon.simulation.native.threads import ThreadPool
 
@@ -68,11 +69,16 @@ _AT_LEAST: Row = {
     "geometric graph of 1,000,000, float32, M/s": 25.0,
     "geometric graph of 1,000,000, float32, two threads to one": 1.6,
     **{f"formations of 4, float{bits}, two threads to one": 1.6 for bits in _BITS},
+    "1,000 formations, float32, over a radio, M/s": 10.0,
+    "1,000 formations, float32, radio to ideal": 0.25,
+    "100,000 over a lossy radio, float32, M/s": 2.0,
+    "1,000 formations, float64, wind and noise, to JAX": 5.0,
 }
 """What each number must reach."""
 _AT_MOST: Row = {
     "geometric graph of 1,000,000, float32, built and ordered, CPU s": 5.0,
     "geometric graph of 1,000,000, float32, peak GB": 3.0,
+    "100,000 over a lossy radio, float32, peak GB": 2.0,
     "10,000 formations, 1,000 steps, cold, CPU s": 10.0,
     "10,000 formations, 1,000 steps, compiled, CPU s": 1.5,
     "10,000 runs of `paper` with dataset, reckoned, wall s": 180.0,
@@ -260,6 +266,54 @@ def measure_geometric(bits: int, _: Yardstick | None) -> Row:
     }
 
 
+# ---- worlds that are not ideal ----
+
+
+def measure_radio(_: Yardstick | None) -> Row:
+    """Return the rates of formations over a radio, each with draws of its own, and without it."""
+    radio = ech.build(ech.load_scenario("paper-radio"))[0]
+    ways = dict[str, Callable[[], float]]()
+    for way, parts in {"over a radio": radio, "ideal": radio.replace(world=ech.World())}.items():
+        stepper, reference = made.seeded(parts, 32, 1_000)
+        ways[way] = partial(rate, stepper, 4_000, [STEPS], reference, 32)
+    found = turns("1,000 formations, float32", ways)
+    best = [found.pop(f"1,000 formations, float32, {way}, M/s") for way in ways]
+    return {
+        "1,000 formations, float32, over a radio, M/s": best[0],
+        "1,000 formations, float32, ideal, M/s": best[1],
+        "1,000 formations, float32, radio to ideal": round(best[0] / best[1], 3),
+    }
+
+
+def measure_lossy_swarm(_: Yardstick | None) -> Row:
+    """Return the rate of a swarm over a radio that loses messages, and the memory it takes."""
+    edges, name = scattered(100_000), "100,000 over a lossy radio, float32"
+    agents, parts = int(edges.max()) + 1, ech.build(ech.load_scenario("paper-radio"))[0]
+    graph = ech.Graph.from_edges(edges, agents=agents)
+    offsets = ech.Formation(np.zeros((agents, len(parts.model.state_names))))
+    parts = parts.replace(graph=graph, formation=offsets, initial={"position": 1.0})
+    side = made.steppers(parts, 32)
+    ways = {"": partial(rate, side.native, agents, [20], side.reference, 32)}
+    best = max(turns("", ways).values())
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    return {f"{name}, M/s": best, f"{name}, peak GB": round(peak, 2)}
+
+
+def measure_wind(_: Yardstick | None) -> Row:
+    """Return the rates of formations in wind, that measure with noise, beside JAX's."""
+    parts = ech.build(ech.load_scenario("paper-global"))[0]
+    noise = ech.Sensing(noise={"position": 0.005, "velocity": 0.02})
+    world = ech.World(sensing=noise, disturbance=ech.Disturbance(rms={"velocity": 1.0}))
+    stepper, reference = made.seeded(parts.replace(world=world), 64, 1_000)
+    by_jax = JaxFormations(stepper.loops, stepper.states, "")
+    told = 4_000, [100], reference, 64
+    both = {"native": partial(rate, stepper, *told), "JAX": partial(rate, by_jax, *told)}
+    return {
+        k.replace("float64, ", "float64, wind and noise, "): v
+        for k, v in turns("1,000 formations, float64", both).items()
+    }
+
+
 # ---- whole runs ----------------------------------------------------------------------------------
 
 
@@ -298,9 +352,9 @@ def measure_models(_: Yardstick | None) -> Row:
         side = made.steppers(ech.build(ech.load_scenario(name))[0], 64)
         # What JAX does once in a process is done.
         begin = time.process_time()
-        Kernels().of(side.native.varying, 64, False, side.native.places.row_major)
+        kernel = Kernels().of(side.native.varying, 64, False, side.native.places.row_major)
         makes[name] = time.process_time() - begin
-        loads[name] = min(_reloaded(program(side.native.plan)) for _ in range(3))
+        loads[name] = min(_reloaded(kernel.made.text) for _ in range(3))
     return {
         "a model traced and compiled, the slowest, CPU s": round(max(makes.values()), 2),
         "code of a model from the cache, the slowest, ms": round(1e3 * max(loads.values()), 1),
@@ -357,6 +411,7 @@ GROUPS: dict[str, list[Measure]] = {
     ],
     "million": [partial(measure_ring, _MILLION, bits) for bits in _BITS],
     "geometric": [partial(measure_geometric, 32)],
+    "worlds": [measure_lossy_swarm, measure_radio, measure_wind],
     "fleet": [measure_fleet, measure_sweep],
     "models": [measure_models, measure_command],
     "peers": [measure_peers],

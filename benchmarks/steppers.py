@@ -172,6 +172,24 @@ def _regained(loop: Loop, draws: np.random.Generator) -> Loop:
     return eqx.tree_at(numbers, loop, other)
 
 
+def seeded(parts: ech.Parts, bits: int, count: int) -> tuple[NativeStepper, np.ndarray]:
+    """Return what steps formations of a seed each, with draws of their own, and the reference."""
+    kind: Any = f"float{bits}"
+    chosen = ech.Settings(horizon=50.0, dt=DT, precision=kind)
+    first = prepare(parts, chosen)
+    drive, starts, loops = first.parts.drive, list[np.ndarray](), list[Loop]()
+    assert isinstance(drive, ech.Laws)
+    for seed in range(count):
+        problem = prepare(first.parts, chosen._replace(seed=seed)).problem
+        with precision("float64"):
+            loops.append(assemble(problem, drive.leader, drive.follower))
+        starts.append(problem.states)
+    with precision("float64"):
+        reference = drive.reference_states(parts.model, DT * jnp.arange(10_001))
+    with precision(kind):
+        return NativeStepper(loops, np.concatenate(starts), bits, None), np.asarray(reference)
+
+
 # ---- the yardstick -------------------------------------------------------------------------------
 
 
