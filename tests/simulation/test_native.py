@@ -666,8 +666,84 @@ def test_drawn_worlds_step_as_by_jax(seed):
     check_alike(parts, run_settings(substeps=1 + seed % 2), tolerance=3e-8 if drawn else 1e-13)
 
 
-def test_formations_over_a_radio_are_those_alone_with_draws_of_their_own():
-    radio = ech.Network(rate=50.0, delay=0.02, jitter=0.02, loss=0.2, messages="state")
+# ---- who leads, and whom agents use --------------------------------------------------------------
+
+Cut, Join, Lose = ech.network.Cut, ech.network.Join, ech.network.Lose
+FLAT = ech.models.DoubleIntegrator()
+BOTH, RETURNS = [Lose(0, 0.4), Lose(1, 0.9)], [Lose(0, 0.4), Join(0, 1.0)]
+BACKUPS = {"leadership": ech.Leadership((1, 2), timeout=0.2)}
+LOSSY = {"rate": 25.0, "delay": 0.02, "jitter": 0.03, "loss": 0.3}
+NEARER = ech.Network(hears="leaderward", **LOSSY)
+WITHOUT_PLAN = ech.Network(hears="leaderward", messages="state", **LOSSY)
+
+
+def carts(network=None, coupling=None, reacts=False, **more):
+    """Return carts of which the leader may be lost: the coupling is that of a law of states."""
+    graph = ech.Graph([(0, 1), (1, 2), (2, 3), (3, 0), (1, 3)])
+    places = {1: [1.0, 0.0], 2: [2.0, 0.0], 3: [0.0, 1.0]}
+    circle = ech.references.Circle(radius=2.0, rate=0.7)
+    drive = ech.Laws(ech.laws.StoppingLeader(reference=circle), ech.laws.StoppingPoint())
+    if coupling is not None:
+        gain = ech.synthesize(FLAT, graph, ech.gains.Riccati(coupling=coupling))
+        feeds = {"feedforward": "none"} if reacts else {}
+        leader = ech.laws.Tracking(circle, reaction=gain if reacts else None)
+        drive = ech.Laws(leader, ech.laws.Consensus(gain, **feeds))
+    formation = ech.Formation.from_offsets(FLAT, graph, places)
+    more = {"world": ech.World(network=network), "initial": {"position": 0.5}} | more
+    return ech.Parts(FLAT, graph, formation, drive, **more)
+
+
+def turning(parts):
+    moving = parts.formation.moving(FLAT, parts.graph, [ech.network.Rotate(0.8)])
+    return parts.replace(formation=moving)
+
+
+TIRED = ech.World(sensing=ech.Sensing(delay=0.04), actuator=ech.Actuator(lag=0.05))
+LATER = [Cut((0, 1), 0.3, 0.5), Lose(2, 0.5), Join(2, 1.0)]
+LEADERS = {
+    "both leaders are lost": carts(events=BOTH, **BACKUPS),
+    "a leader returns": carts(coupling=1.0, events=RETURNS, **BACKUPS),
+    "a leader that reacts": carts(coupling=1.0, reacts=True, events=BOTH, **BACKUPS),
+    "late sensors": carts(events=BOTH, world=TIRED, **BACKUPS),
+    "places that turn": turning(carts(events=BOTH, **BACKUPS)),
+    "nearer neighbours": carts(NEARER, events=LATER),
+    "nearer neighbours and backups": carts(NEARER, events=[*LATER, Lose(0, 0.4)], **BACKUPS),
+    "states of nearer neighbours": carts(WITHOUT_PLAN, events=LATER),
+}
+QUICK = ("a leader returns", "states of nearer neighbours")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in LEADERS],
+)
+def test_backup_leaders_and_chosen_neighbours_step_as_by_jax(name):
+    check_alike(LEADERS[name], run_settings(dt=0.02, horizon=3.0), (1, 0, 17, 40, 0, 30, 1))
+
+
+@pytest.mark.slow
+def test_backup_leaders_of_many_blocks_step_as_by_jax():
+    graph = ech.Graph([(k, (k + far) % 20) for k in range(20) for far in (1, 3)])
+    events = [Lose(0, 0.2), Lose(5, 0.5), Lose(13, 0.8), Join(4, 0.3)]
+    ranks = ech.Leadership((5, 13, 7, 12, 9, 3, 2, 1, 19, 18, 17), timeout=0.1)
+    parts = flock(graph, FLAT, events=events, leadership=ranks)
+    check_alike(parts, run_settings(), (1, 0, 17, 100, 0, 80))
+    chunks = []
+    _, stepper = ready(parts, run_settings(), "native")
+    with jax.enable_x64(True):
+        table = np.zeros((90, 4))
+        for count in (1, 3):
+            stepper.threads = threads.ThreadPool(stepper.places, None, count)
+            chunks.append(stepper.advance(stepper.start(), np.array([5, 80]), table))
+    assert chunks[0].now.states.tobytes() == chunks[1].now.states.tobytes()
+
+
+RADIO = {"rate": 50.0, "delay": 0.02, "jitter": 0.02, "loss": 0.2, "messages": "state"}
+
+
+@pytest.mark.parametrize("hears", ["all", pytest.param("leaderward", marks=pytest.mark.slow)])
+def test_formations_over_a_radio_are_those_alone_with_draws_of_their_own(hears):
+    radio = ech.Network(**RADIO, hears=hears)
     world = ech.World(network=radio, sensing=ech.Sensing(noise={"position": 0.01}))
     parts = row(ech.Graph.path(4), 1.0).replace(world=world)
     chosen = run_settings(store_every=20, engine="native")
@@ -679,15 +755,38 @@ def test_formations_over_a_radio_are_those_alone_with_draws_of_their_own():
     assert np.ptp([one.states[-1, 1:] for one in flown], axis=0).min() > 0.0
 
 
-def test_a_run_over_a_radio_goes_on_with_the_same_bits_from_any_moment():
-    radio = ech.Network(rate=50.0, delay=0.02, jitter=0.02, loss=0.2, messages="state")
-    world = ech.World(network=radio, actuator=ech.Actuator(lag=0.05))
-    parts = row(ech.Graph.path(4), 1.0).replace(world=world)
-    prepared, stepper = ready(parts, run_settings(), "native")
-    whole = steps_of(prepared, stepper, run_settings(), (150,))
+def test_formations_whose_backups_wait_for_other_times_are_those_alone():
+    chosen = run_settings(dt=0.02, horizon=3.0, store_every=10, engine="native")
+    times = 0.1 + 0.04 * np.arange(9)
+    waiting = (ech.Leadership((1, 2), timeout=time) for time in times)
+    runs = [(carts(coupling=1.0, events=BOTH, leadership=each), chosen) for each in waiting]
+    flown = [*Batch(1).fly(runs)]
+    for one, run in zip(flown, runs, strict=True):
+        np.testing.assert_array_equal(one.states, ech.simulate(*run).states)
+    assert len({one.states.tobytes() for one in flown}) == len(runs)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "a radio",
+        pytest.param("a leader returns", marks=pytest.mark.slow),
+        pytest.param("nearer neighbours and backups", marks=pytest.mark.slow),
+    ],
+)
+def test_a_run_goes_on_with_the_same_bits_from_any_moment(name):
+    world = ech.World(network=ech.Network(**RADIO), actuator=ech.Actuator(lag=0.05))
+    parts = LEADERS.get(name, row(ech.Graph.path(4), 1.0).replace(world=world))
+    chosen = run_settings(dt=0.02, horizon=3.0) if name in LEADERS else run_settings()
+    prepared, stepper = ready(parts, chosen, "native")
+    whole = steps_of(prepared, stepper, chosen, (150,))
     with jax.enable_x64(True):
-        now = stepper.start()
-        for count in (7, 90, 53):
-            now = stepper.recall(numbers(stepper.advance(now, np.array([count]), None).now))
+        times = chosen.dt * jnp.arange(151)
+        wanted = prepared.parts.drive.reference_states(prepared.parts.model, times)
+        now, step = stepper.start(), 0
+        for count in (7, 23, 67, 53):
+            rest = None if wanted is None else np.asarray(wanted)[step:]
+            now = stepper.recall(numbers(stepper.advance(now, np.array([count]), rest).now))
+            step += count
     for a, b in zip(numbers(whole.now), numbers(now), strict=True):
         np.testing.assert_array_equal(a, b)

@@ -73,11 +73,25 @@ class Exchange(eqx.Module):
         difference: Difference = operator.sub,
     ) -> Float[jax.Array, "N s"]:
         """Return the mean differences (N, s) along used links (K,); `alone` (N, s) without any."""
-        weights = jnp.where(used, jnp.asarray(self.weights, values.dtype), 0.0)
-        chosen = Exchange(self.receivers, self.senders, weights)
-        total = jax.ops.segment_sum(weights, self.receivers, num_segments=len(values))[:, None]
-        z = chosen(values, received, difference)
+        weights, total = self._of_used(used, len(values), values.dtype)
+        total = total[:, None]
+        z = Exchange(self.receivers, self.senders, weights)(values, received, difference)
         return jnp.where(total > 0.0, z / jnp.where(total > 0.0, total, 1.0), alone)
+
+    def shares(
+        self, used: Bool[jax.Array, " K"], agents: int
+    ) -> tuple[Float[jax.Array, " K"], Bool[jax.Array, " N"]]:
+        """Return the weights (K,) of links in that mean, and which agents (N,) use no link."""
+        weights, total = self._of_used(used, agents, float)
+        alone = total <= 0.0
+        return weights / jnp.where(alone, 1.0, total)[jnp.asarray(self.receivers)], alone
+
+    def _of_used(
+        self, used: Bool[jax.Array, " K"], agents: int, dtype: jax.typing.DTypeLike
+    ) -> tuple[Float[jax.Array, " K"], Float[jax.Array, " N"]]:
+        """Return the weights (K,) of used links, 0 of others, and their sums (N,)."""
+        weights = jnp.where(used, jnp.asarray(self.weights, dtype), 0.0)
+        return weights, jax.ops.segment_sum(weights, self.receivers, num_segments=agents)
 
 
 class Near(NamedTuple):

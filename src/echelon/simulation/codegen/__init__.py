@@ -2,7 +2,17 @@
 
 from echelon.simulation.codegen.block_copy import copy_rows
 from echelon.simulation.codegen.factoring import factored
-from echelon.simulation.codegen.kernel_plan import SHIFTED, SLOTS, TASK, Body, Letters, Plan, stride
+from echelon.simulation.codegen.kernel_plan import (
+    ANNOUNCE,
+    PRIOR,
+    SHIFTED,
+    SLOTS,
+    TASK,
+    Body,
+    Letters,
+    Plan,
+    stride,
+)
 from echelon.simulation.codegen.kernel_text import program
 from echelon.simulation.codegen.machine_code import (
     Code,
@@ -14,6 +24,8 @@ from echelon.simulation.codegen.neighbours import has_flag
 from echelon.simulation.codegen.scheduling import shared
 
 __all__ = [
+    "ANNOUNCE",
+    "PRIOR",
     "SHIFTED",
     "SLOTS",
     "TASK",

@@ -17,9 +17,10 @@ _NONE: Mapping[int, Node] = {}
 class Body(NamedTuple):
     """What some of the agents compute in a step; the same code for all of them.
 
-    A leaf is ("row", r), ("z", k), ("message", k), ("leader", k), ("ahead", k), ("self", k),
-    ("neighbour", k), what a neighbour shows, or the last number k that came by its link; or, the
-    same for all agents, ("step",), ("steady",), ("table", c), ("uniform", k).
+    A leaf is ("row", r), ("z", k), ("message", k), ("leader", k), ("ahead", k), ("alone",), 1 where
+    an agent uses no link, ("self", k), ("neighbour", k), what a neighbour shows, or ("link", k),
+    the last number k that came by its link; or, the same for all agents, ("step",), ("steady",),
+    ("table", c), ("uniform", k).
 
     Attributes:
         stores: row -> its new value.
@@ -85,12 +86,15 @@ class Letters(NamedTuple):
         value: of them the first, which a receiver keeps for each link, with the last one.
         packet: rows of an agent with the others, which are passed on: of the newest it received.
         slots: letters of each agent that are stored.
+        chosen: whether it depends on the step and the formation whose letters agents use, and so
+            do the weights of their links.
     """
 
     size: int
     value: int
     packet: range
     slots: int
+    chosen: bool = False
 
     @property
     def kept(self) -> list[int]:
@@ -113,6 +117,8 @@ class Plan(NamedTuple):
             `neighbours.has_flag`, if there is one.
         first: the body of the agents that act first.
         others: the body of all others, level by level.
+        announce: what the agents that act first announce to all others in each step before any of
+            them acts; None of nothing. Then whose message each receives differs between formations.
         prior_first, prior_others: what both do in each step before any agent acts; None of nothing.
             Then neighbours read what these show, and not what the step before has shown.
         message_start: the first row of what an agent sends besides its state.
@@ -165,11 +171,12 @@ class Plan(NamedTuple):
     letters: Letters | None = None
     prior_first: Body | None = None
     prior_others: Body | None = None
+    announce: Body | None = None
 
     @property
     def bodies(self) -> dict[str, Body]:
         """The bodies by their names."""
-        names = "first", "others", "prior_first", "prior_others"
+        names = "first", "others", "prior_first", "prior_others", "announce"
         bodies = ((name, getattr(self, name)) for name in names)
         return {name: body for name, body in bodies if body is not None}
 
@@ -266,9 +273,10 @@ SLOTS = (
     "tape_step",
     "ahead_step",
     "arrivals_step",
+    "weights_step",
     "pair_count",
 )
-"""The arguments of a kernel: 27 addresses and 16 whole numbers of 64 bits.
+"""The arguments of a kernel: 27 addresses and 17 whole numbers of 64 bits.
 
 Formations are stored in groups of as many as a vector has lanes; `rows`, the mirrors and `edges`
 are those of the first of some groups, which have `blocks` and `edge_blocks` each. A swarm is one
@@ -291,7 +299,8 @@ processor.
 `ring` has the last letters, row after row of all agents; `mail` has for each slot of a neighbour
 what is kept of the last one. `arrivals` has for each slot, and behind them for each agent of which
 a packet is newer, the place in `ring`, and `arrivals_step` lie between two steps; `sends` has for
-each step the row that is written.
+each step the row that is written. Where agents choose whose letters they use, `weights` has for
+each slot a weight, and behind them for each agent 1 if it uses none, `weights_step` numbers a step.
 
 `pairs` has the least square of the distance of each two agents of a formation, `pair_count` of
 them, and the step of it; `pair_ends` has the blocks of the two.
@@ -299,7 +308,9 @@ them, and the step of it; `pair_ends` has the blocks of the two.
 TASK = ("passed", "level", "start", "end", "first_edge", "last_edge", "before", "after")
 """Of a task: the steps before it in this call, the level, and where its blocks begin and end.
 
-Level 0 are the leaders, and -1 is what all do before any of them acts."""
+Level 0 are the leaders, `PRIOR` is what all do before any of them acts, and `ANNOUNCE` what the
+leaders do then."""
+PRIOR, ANNOUNCE = -1, -2
 ADDRESSES = 27
 
 

@@ -15,14 +15,16 @@ from collections.abc import Iterator, Sequence
 from echelon.simulation.codegen.emitter import Emitter, find_fast_path, general_case, large_choices
 from echelon.simulation.codegen.kernel_plan import (
     ADDRESSES,
+    ANNOUNCE,
     NO_MINIMUM,
+    PRIOR,
     SLOTS,
     TASK,
     Body,
     Context,
     Plan,
 )
-from echelon.simulation.codegen.letters import part_of_group, send, take
+from echelon.simulation.codegen.letters import at_step, part_of_group, send, take, uses_none
 from echelon.simulation.codegen.neighbours import (
     exchange,
     leader_row,
@@ -100,6 +102,8 @@ def _group(w: Writer, plan: Plan, slots: dict[str, str], group: str) -> dict[str
         "pairs": (w.put(f"mul i64 {group}, {slots['pair_count']}"), 2 * plan.lanes),
     }
     own = {name: w.part(slots[name], *part) for name, part in parts.items()}
+    if plan.announce:
+        own["sources"] = w.part(slots["sources"], blocks, plan.lanes, "i32")
     if plan.letters:
         own |= part_of_group(w, plan.letters, slots, group)
     return slots | own
@@ -111,8 +115,7 @@ def _tasks(w: Writer, plan: Plan, slots: dict[str, str], numbers: int) -> None:
         task = {name: w.load("i64", slots["schedule"], first, k) for k, name in enumerate(TASK)}
         wait(w, slots, task["before"], task["after"])
         context = _context(w, plan, slots, task["passed"], numbers)
-        if plan.listens_first:
-            _prior(w, context, task)
+        _before_all(w, context, task)
         leads = w.put(f"icmp eq i64 {task['level']}, 0")
         lead, follow, done = (w.fresh(stem) for stem in ("lead", "follow", "done"))
         w.do(f"br i1 {leads}, label %{lead}, label %{follow}")
@@ -129,9 +132,17 @@ def _tasks(w: Writer, plan: Plan, slots: dict[str, str], numbers: int) -> None:
         announce(w, slots, number)
 
 
+def _before_all(w: Writer, context: Context, task: dict[str, str]) -> None:
+    """Write the tasks that come before any agent acts; of the others then nothing is left."""
+    if context.plan.listens_first:
+        _prior(w, context, task)
+    if context.plan.announce:
+        _announce(w, context, context.plan.announce, task)
+
+
 def _prior(w: Writer, context: Context, task: dict[str, str]) -> None:
     """Write what all do before any of them acts, if that is the task; then no other is."""
-    before = w.put(f"icmp slt i64 {task['level']}, 0")
+    before = w.put(f"icmp eq i64 {task['level']}, {PRIOR}")
     bound = context.slots["leader_blocks"]
     context = context._replace(next_mirror=context.mirror)
     with only_if(w, w.put(f"zext i1 {before} to i64")):
@@ -147,9 +158,23 @@ def _prior(w: Writer, context: Context, task: dict[str, str]) -> None:
                     base = w.part(here.slots["rows"], block, here.plan.rows * here.plan.lanes)
                     take(w, here, block, base)
                 _act(w, here, body, block)
-    # The other levels have no blocks then.
+    _end_if(w, before, task)
+
+
+def _announce(w: Writer, context: Context, body: Body, task: dict[str, str]) -> None:
+    """Write what leaders announce, if that is the task; then no other is."""
+    before = w.put(f"icmp eq i64 {task['level']}, {ANNOUNCE}")
+    with only_if(w, w.put(f"zext i1 {before} to i64")):
+        here = _with_uniform(w, context, body)
+        with loop(w, task["start"], task["end"]) as (block, _, _):
+            _act(w, here, body, block)
+    _end_if(w, before, task)
+
+
+def _end_if(w: Writer, done: str, task: dict[str, str]) -> None:
+    """Write that a task has no blocks left if it is done."""
     for name in ("start", "end", "first_edge", "last_edge"):
-        task[name] = w.put(f"select i1 {before}, i64 0, i64 {task[name]}")
+        task[name] = w.put(f"select i1 {done}, i64 0, i64 {task[name]}")
 
 
 def _least(w: Writer, a: str, b: str) -> str:
@@ -173,9 +198,7 @@ def _context(w: Writer, plan: Plan, slots: dict[str, str], passed: str, numbers:
         mirror = next_mirror = slots["mirror"]
     context = Context(plan, slots, mirror, next_mirror, step, "", values, tape=tape, given=given)
     if plan.letters:
-        arrivals = w.part(slots["arrivals"], passed, slots["arrivals_step"], "i32")
-        sends = w.load("i64", w.at("i64", slots["sends"], passed))
-        return context._replace(arrivals=arrivals, sends=sends)
+        return at_step(w, context, passed)
     return _ahead(w, context, passed) if plan.leaders_ahead else context
 
 
@@ -278,6 +301,8 @@ def _load(
         return w.load_row(base, rest[0])
     if kind == "ahead":
         return w.load_row(w.part(context.given, block, plan.given * plan.lanes), rest[0])
+    if kind == "alone":
+        return uses_none(w, context, block)
     if kind == "message":
         start, row = context.slots["rows"], plan.message_start + rest[0]
         if plan.leaders_ahead:
@@ -363,7 +388,8 @@ def _look_up(
 ) -> str:
     """Write the load of a number of another agent, whose place is in a list of places."""
     places, plan = context.slots[which], context.plan
-    if plan.batched:
+    by_lane = which == "sources" and plan.announce is not None
+    if plan.batched and not by_lane:
         return w.load_row(listed_block(w, places, block, start), row)
     # Messages are stored in rows, and what neighbours read agent by agent or row-major.
     offset = row * plan.lanes if which == "sources" else row

@@ -13,12 +13,31 @@ def part_of_group(w: Writer, letters: Letters, slots: dict[str, str], group: str
     mail = w.put(f"mul i64 {links}, {len(letters.kept) * lanes}")
     both = w.put(f"add i64 {links}, {slots['blocks']}")
     both = w.put(f"mul i64 {both}, {lanes}")
-    return {
+    parts = {
         "ring": w.part(slots["ring"], group, ring),
         "mail": w.part(slots["mail"], group, mail),
         "arrivals": w.part(slots["arrivals"], group, both, "i32"),
         "links": links,
     }
+    return parts | ({"weights": w.part(slots["weights"], group, both)} if letters.chosen else {})
+
+
+def at_step(w: Writer, context: Context, passed: str) -> Context:
+    """Write which letters arrive at a step, whether some are sent, and how much each counts."""
+    slots, letters = context.slots, context.plan.letters
+    assert letters is not None
+    arrivals = w.part(slots["arrivals"], passed, slots["arrivals_step"], "i32")
+    sends = w.load("i64", w.at("i64", slots["sends"], passed))
+    if letters.chosen:
+        slots = slots | {"weights": w.part(slots["weights"], passed, slots["weights_step"])}
+    return context._replace(arrivals=arrivals, sends=sends, slots=slots)
+
+
+def uses_none(w: Writer, context: Context, block: str) -> str:
+    """Write the load of 1 for the agents of a block that use no letter, 0 for the others."""
+    place = w.put(f"add i64 {context.slots['links']}, {block}")
+    place = w.put(f"mul i64 {place}, {w.lanes}")
+    return w.load(w.vector, context.slots["weights"], place)
 
 
 def take(w: Writer, context: Context, block: str, base: str) -> None:

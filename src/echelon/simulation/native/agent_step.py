@@ -34,12 +34,12 @@ from echelon.simulation.step.alone import one_row
 from echelon.simulation.step.leadership import NOBODY, FixedLeaders
 from echelon.simulation.step.loop import IdealNetwork, Loop
 from echelon.simulation.step.meter import ALWAYS
-from echelon.simulation.step.networks import LateNetwork, LeaderwardNeighbours
+from echelon.simulation.step.networks import LateNetwork
 from echelon.simulation.step.own_members import own_members
 from echelon.simulation.step.places import MovingPlaces
 from echelon.simulation.step.records import (
+    Clock,
     ComponentMemory,
-    Control,
     Known,
     LawMemories,
     LeaderPackets,
@@ -54,7 +54,7 @@ from echelon.simulation.step.records import (
 )
 from echelon.simulation.step.roster import Everybody, Links
 from echelon.simulation.step.sequence import act, begin, hear, held, saying
-from echelon.simulation.step.turns import by_depth
+from echelon.simulation.step.turns import by_depth, lead
 
 # ---- what native code cannot step ----------------------------------------------------------------
 
@@ -68,19 +68,12 @@ def check_loop(loop: Loop) -> None:
     if own:
         raise Unsupported(f"the member `{own}` of your own")
     check_distances(loop)
-    late = letter_sizes(loop)
-    if late is not None and isinstance(late.network.rules.neighbours, LeaderwardNeighbours):
-        raise Unsupported("agents that use the messages of some neighbours alone")
 
 
 def check_distances(loop: Loop) -> None:
-    """Raise `Unsupported` if agents need others' hulls, or who leads in the same step."""
-    for fault, text in (
-        (loop.surroundings.keeps_apart, "agents that keep away from each other"),
-        (loop.laws.backups and not loop.network.late, "backup leaders in the ideal network"),
-    ):
-        if fault:
-            raise Unsupported(text)
+    """Raise `Unsupported` if agents need others' hulls."""
+    if loop.surroundings.keeps_apart:
+        raise Unsupported("agents that keep away from each other")
 
 
 # ---- the rows of a block -------------------------------------------------------------------------
@@ -96,13 +89,15 @@ class BlockRows(NamedTuple):
         memory: of its law, its sensors and its plant, one number after the other.
         sensed: what it knows of its state, what it says, and what it makes of its messages; none
             where it knows and says x.
-        packet: of the newest message from a leader, what a leader says of itself, and when.
+        packet: of the newest message from a leader, what a leader says of itself, and over a late
+            network when.
         cut: to which side limits moved each input in the previous step (m,).
         message: what it sends besides its state.
         input: that is applied (m,).
         varying: numbers of its law and model that differ between formations.
         here: whether it is there, where some come or go.
         lead: 1 while it leads, 2 where it takes the lead, where backup leaders do.
+        sent: 1 while an agent that leads announces to it what it does.
         errors, tracking: as in `Sums`, but of the steps before the steady window and in it.
         effort, limited, unsettled, inside, chatter, outputs: as in `Sums`.
         peak: minus the largest squared error since the last event; empty without events.
@@ -123,6 +118,7 @@ class BlockRows(NamedTuple):
     varying: range
     here: range
     lead: range
+    sent: range
     errors: range
     effort: range
     limited: range
@@ -146,8 +142,10 @@ class BlockRows(NamedTuple):
         sizes = [n, n, sum(map(row_size, agent_rows(loop)[1:])), max(map(memory_size, memories))]
         late = letter_sizes(loop)
         sizes += [sum(sensed_sizes(loop)) * listens_first(loop)]
-        sizes += [0 if late is None else late.packet + 1, m, forward_size(loop), m, varying]
-        sizes += [loop.roster.changes, loop.laws.backups]
+        forward, announces = forward_size(loop), loop.network.announces
+        packet = forward * announces if late is None else late.packet + 1
+        sizes += [packet, m, forward, m, varying]
+        sizes += [loop.roster.changes, loop.laws.backups, announces]
         sizes += [2, 1, 1, 1, len(loop.meter.charted), 1]
         sizes += [min(1, len(loop.meter.events)), *[loop.meter.extremes] * 2]
         sizes += [2, len(loop.model.output_names), 1]
@@ -356,9 +354,11 @@ def _network_of(loop: Loop, leads: bool, inputs: "StepInputs", acts: bool) -> Id
     packet = LeaderPackets(leader, stamp, content, ())
     if not acts:
         return _Reads(first, rules, late.network.medium, packet, elected)
-    _, _, expected, forward, _ = _parts(loop, inputs.sensed)
-    hops = jnp.zeros(1, jnp.int32)
-    rows = forward[None], expected[None], hops, packet
+    _, said, expected, forward, knows = _parts(loop, inputs.sensed)
+    if inputs.alone is not None:
+        rows = said[None], expected[None], knows != 0.0
+        z = jnp.where(inputs.alone, rules.alone(loop, *rows), z)
+    rows = forward[None], expected[None], jnp.zeros(1, jnp.int32), packet
     heard = NetworkEstimate(z, jnp.asarray(leading), *rows)
     return _Writes(first, rules, late.network.medium, packet, heard)
 
@@ -398,8 +398,11 @@ class StepInputs(NamedTuple):
         leader: its leader's state less its offset; None of a leader that always leads.
         previous_cut: as in `LoopState`.
         packet: the newest of a leader.
+        alone: whether it uses no message, a truth; None where all use those of all neighbours.
         here: whether it is there, a truth; None where all always are.
         lead: as in `BlockRows`; None where that never changes.
+        sent: whether it is sent a message in this step, else it has that of the packet; None where
+            nobody announces anything.
     """
 
     step: Entries
@@ -414,8 +417,16 @@ class StepInputs(NamedTuple):
     leader: Entries
     previous_cut: Entries
     packet: Entries
+    alone: Entries
     here: Entries
     lead: Entries
+    sent: Entries
+
+    def received(self) -> "StepInputs":
+        """Return the same with the message that counts."""
+        if self.sent is None:
+            return self
+        return self._replace(message=jnp.where(self.sent, self.message, self.packet))
 
 
 Outputs: TypeAlias = dict[str, Entries]
@@ -453,31 +464,40 @@ def prior_step(own: Loop, inputs: StepInputs) -> Outputs:
     }
 
 
-def _goal(own: Loop, clock: Steps, inputs: StepInputs) -> jax.Array:
+def _goal(own: Loop, clock: Clock, inputs: StepInputs) -> jax.Array:
     goals = own.places.goals(clock.t)
     return inputs.rows[0][0] if goals is None else goals[0]
 
 
-def _acted(own: Loop, now: LoopState, clock: Steps, inputs: StepInputs) -> tuple[Control, Known]:
-    """Return what an agent does, and what it knows."""
+def _known(
+    own: Loop, now: LoopState, clock: Steps, inputs: StepInputs
+) -> tuple[Known, PyTree, PyTree]:
+    """Return what an agent knows, and what sensing and network remember after it."""
     if inputs.sensed is None:
-        known, sensing, network = hear(own, now, clock)
-    else:
-        x, said = (part[None] for part in _parts(own, inputs.sensed)[:2])
-        offsets = own.places.groups(own.model, own.laws, clock.t)
-        mine = Own(jnp.asarray(own.laws.numbers), x)
-        here = own.roster.here(clock.step)
-        known = Known(clock, here, mine, offsets, said, own.graph.exchange)
-        heard, network = own.network.receive(own, (), known)
-        known, sensing = known._replace(heard=heard), now.memory.sensing
-    return act(own, now, known, sensing, network), known
+        return hear(own, now, clock)
+    x, said = (part[None] for part in _parts(own, inputs.sensed)[:2])
+    offsets = own.places.groups(own.model, own.laws, clock.t)
+    mine = Own(jnp.asarray(own.laws.numbers), x)
+    here = own.roster.here(clock.step)
+    known = Known(clock, here, mine, offsets, said, own.graph.exchange)
+    heard, network = own.network.receive(own, (), known)
+    return known._replace(heard=heard), now.memory.sensing, network
+
+
+def announcing_step(own: Loop, inputs: StepInputs) -> Outputs:
+    """Return what an agent announces to all others if it leads, before anybody acts."""
+    now, clock = _moment(inputs), Steps(inputs.step, own.motion.dt)
+    known = _known(own, now, clock, inputs)[0]
+    message = lead(own, known, now.memory.laws).message[0]
+    return {"message": message, "mirror_before": _shown_before(own, inputs, known)}
 
 
 def agent_step(own: Loop, inputs: StepInputs) -> Outputs:
     """Return what an agent does in a step."""
     now, clock, meter = _moment(inputs), Steps(inputs.step, own.motion.dt), own.meter
     x, goal = inputs.x, _goal(own, clock, inputs)
-    acted, known = _acted(own, now, clock, inputs)
+    known, *rest = _known(own, now, clock, inputs)
+    acted = act(own, now, known, *rest)
     u, cut = acted.inputs[0], acted.cut[0]
     # A leader is its own leader, so that its error is zero.
     leader = x - goal if inputs.leader is None else inputs.leader
@@ -495,14 +515,13 @@ def agent_step(own: Loop, inputs: StepInputs) -> Outputs:
         later = Steps(inputs.step + 1, own.motion.dt)
         next_said = saying(own, states, memory.laws, later)[1][0]
         mirrors = {"mirror": _shown(own, states[0] - goal, next_said)}
-        mirrors["mirror_before"] = _shown(own, x - goal, known.said[0])
+        mirrors["mirror_before"] = _shown_before(own, inputs, known)
     elif own.network.late:
         _, said, expected, _, knows = _parts(own, inputs.sensed)
         mirrors["mirror_before"] = jnp.concatenate([said, expected, knows])
         mirrors["letter"] = _flat(acted.memory.network)
     else:
-        goals = jnp.zeros(len(shown_goals(own)))
-        mirrors["mirror_before"] = jnp.concatenate([x - goal, goals, known.said[0]])
+        mirrors["mirror_before"] = _shown_before(own, inputs, known)
     sums = {
         "errors": metered.errors,
         "tracking": tracking,
@@ -523,6 +542,7 @@ def agent_step(own: Loop, inputs: StepInputs) -> Outputs:
             "memory": _flat(memory._replace(network=())),
             "cut": after.cut[0],
             "message": acted.message[0],
+            "packet": inputs.message,
             "input": u,
         }
     )
@@ -530,6 +550,15 @@ def agent_step(own: Loop, inputs: StepInputs) -> Outputs:
 
 _NOTHING = {"unsettled": -1.0, "inside": ALWAYS, "lowest": np.inf, "highest": -np.inf}
 """What an agent that is absent adds to sums, where it is not 0."""
+
+
+def _shown_before(own: Loop, inputs: StepInputs, known: Known) -> jax.Array:
+    """Return what neighbours read of an agent before it acts, in a network that is not late."""
+    goal, said = _goal(own, known.clock, inputs), known.said[0]
+    if inputs.sensed is None:
+        return _shown(own, inputs.x - goal, said)
+    goals = jnp.zeros(len(shown_goals(own)))
+    return jnp.concatenate([inputs.x - goal, goals, said])
 
 
 def _shown(own: Loop, y: jax.Array, said: jax.Array) -> jax.Array:
@@ -546,11 +575,13 @@ class Program(NamedTuple):
         body: of a step, after everybody has sensed and spoken if that is a part of its own.
         prior: that part; None without one.
         given: what the host computes ahead of both.
+        announce: what leaders announce in between; None of nothing.
     """
 
     body: Body
     prior: Body | None
     given: HostPart
+    announce: Body | None = None
 
 
 def program_of(
@@ -579,7 +610,8 @@ def program_of(
             keys: list[jax.Array], number: jax.Array, leaves: list[jax.Array], inputs: StepInputs
         ) -> list[jax.Array]:
             own = varying.filled(leaves, keys)
-            network = _network_of(own, leads, inputs, step is agent_step)
+            inputs = inputs.received()
+            network = _network_of(own, leads, inputs, step is not prior_step)
             own = _of_one(own, leads, number, inputs.rows, network)
             present = _Present(True if inputs.here is None else inputs.here)
             results.update(step(own.replace(roster=present), inputs))
@@ -595,8 +627,15 @@ def program_of(
         mine = traced(prior_step, inputs._replace(sensed=None))
         stores = _placed(rows, mine, ("memory", "sensed", "packet"))
         prior = _finished(graph, Body(stores=stores, mirror=mine["mirror"]))
+    announce = None
+    if leads and loop.network.announces:
+        mine = traced(announcing_step, inputs)
+        stores, before = _placed(rows, mine, ("message",)), mine["mirror_before"]
+        difference = _difference(loop, graph)
+        announce = Body(stores=stores, mirror_before=before, difference=difference)
+        announce = _finished(graph, announce)
     body = _body(loop, graph, rows, inputs, traced(agent_step, inputs), leads, leads and follows)
-    return Program(_finished(graph, body), prior, given)
+    return Program(_finished(graph, body), prior, given, announce)
 
 
 def _finished(graph: ScalarGraph, body: Body) -> Body:
@@ -625,8 +664,10 @@ def _body(
     last = {"unsettled": [graph.make("select", *each) for each in pairs]}
     stores |= _placed(rows, last, ("unsettled",))
     # Unless inputs are passed on from parents, nobody reads the message of a follower.
-    if (leads or by_depth(loop)) and not loop.network.late:
+    announces = loop.network.announces
+    if (leads or by_depth(loop)) and not (loop.network.late or announces):
         stores |= _placed(rows, outputs, ("message",))
+    stores |= _placed(rows, outputs, ("packet",) * announces)
     sums = {name: outputs[name] for name in ("effort", "limited", "chatter")}
     sums |= {"errors": _before_and_in_window(inputs, outputs["errors"])}
     if tracks:
@@ -708,14 +749,16 @@ def _step_inputs(
     changes = loop.laws.backups
     shown = said_size(loop) if loop.network.late else n + shown_size(loop)
     # A truth and not a number, since it chooses between sums.
-    late = graph.make("ne", graph.leaf("steady", uniform=True), 0.0)
+    steady = _truth(graph, graph.leaf("steady", uniform=True))
+    late = letter_sizes(loop)
+    chooses = late is not None and late.network.rules.neighbours.chooses
     ends = [*itertools.accumulate(map(row_size, agent_rows(loop)))]
     own = np.concatenate([offset, row(rows.agent)])
     shapes = [(1, *np.shape(leaf)[1:]) for leaf in agent_rows(loop)]
     pairs = zip([0, *ends[:-1]], ends, shapes, strict=True)
     return StepInputs(
         step=single(graph.leaf("step", uniform=True)),
-        steady=single(late),
+        steady=steady,
         reference=leaves_of(graph, "table", range(n), True) if tracks else None,
         x=x,
         rows=[own[a:b].reshape(shape) for a, b, shape in pairs],
@@ -724,13 +767,15 @@ def _step_inputs(
         z=leaves_of(graph, "z", range(shown - said_size(loop), shown)),
         # A leader receives no input of another agent.
         message=np.zeros(len(rows.message))
-        if leads
+        if leads and not changes
         else leaves_of(graph, "message", range(len(rows.message))),
         leader=None if leads and not changes else leaves_of(graph, "leader", range(n)),
         previous_cut=row(rows.cut),
         packet=row(rows.packet),
+        alone=_truth(graph, graph.leaf("alone")) if chooses else None,
         here=np.array(here, object) if here else None,
         lead=row(rows.lead) if leads and changes else None,
+        sent=_truth(graph, row(rows.sent)[0]) if len(rows.sent) else None,
     )
 
 
@@ -741,6 +786,10 @@ def leaves_of(
     entries = np.empty(len(places), object)
     entries[:] = [graph.leaf(kind, place, uniform=uniform) for place in places]
     return entries
+
+
+def _truth(graph: ScalarGraph, leaf: Node) -> np.ndarray:
+    return single(graph.make("ne", leaf, 0.0))
 
 
 def single(node: Node) -> np.ndarray:

@@ -79,6 +79,7 @@ class Places(abc.ABC):
         reach: of blocks, if leaders may be ahead of all others and it was measured.
         shifts: `shifts` and `edge_shifts` of `Plan`.
         listens_first: as in `Plan`.
+        announces: whether leaders announce what they do before any agent acts.
     """
 
     loop: Loop
@@ -92,6 +93,7 @@ class Places(abc.ABC):
     reach: BlockReach | None = None
     shifts: Shifts = ((), ())
     listens_first: bool = False
+    announces: bool = False
 
     @property
     def edge_blocks(self) -> int:

@@ -74,7 +74,8 @@ def letters_of(loop: Loop, rows: BlockRows) -> Letters | None:
     late = letter_sizes(loop)
     if late is None:
         return None
-    return Letters(late.total, late.value, rows.packet, late.network.medium.slots)
+    chosen = late.network.rules.neighbours.chooses
+    return Letters(late.total, late.value, rows.packet, late.network.medium.slots, chosen)
 
 
 def plan_of(
@@ -98,7 +99,9 @@ def plan_of(
     bodies = (first.body, others.body)
     if batched:
         bodies = tuple(body._replace(tape={}) for body in bodies)
-    weights = np.asarray(loop.graph.exchange.weights)
+    weights, letters = np.asarray(loop.graph.exchange.weights), letters_of(loop, rows)
+    weighted = weighted or bool((weights != 1.0).any()) or loop.network.late and not batched
+    weighted = weighted or letters is not None and letters.chosen
     plan = Plan(
         bits=bits,
         lanes=LANES[bits],
@@ -110,9 +113,9 @@ def plan_of(
         others=bodies[1],
         message_start=rows.message.start,
         message_size=len(rows.message),
-        one_source=one_leader and by_depth(loop) is None,
+        one_source=one_leader and by_depth(loop) is None and first.announce is None,
         one_leader=one_leader,
-        weighted=weighted or bool((weights != 1.0).any()) or loop.network.late and not batched,
+        weighted=weighted,
         edges=loop.meter.measured,
         apart=apart,
         shifts=shifts[0],
@@ -120,15 +123,16 @@ def plan_of(
         exception_row=rows.exception.start,
         table=n if tracks else 0,
         goals=shown_goals(loop),
-        letters=letters_of(loop, rows),
+        letters=letters,
         given=max(first.given.size, others.given.size),
         prior_first=first.prior,
         prior_others=others.prior,
+        announce=first.announce,
         tape_rows=0 if batched else len(loop.meter.paired),
         paired=tuple(rows.state[k] for k in loop.meter.paired) if batched else (),
     )
     # A leader that receives nothing waits for nobody.
-    alone = not plan.first.reads_neighbours and not plan.listens_first
+    alone = not (plan.first.reads_neighbours or plan.listens_first or plan.announce)
     ahead = not batched and by_depth(loop) is None and alone
     plan = plan._replace(width=plan.width + has_flag(plan), leaders_ahead=ahead)
     return plan, (first.given, others.given)

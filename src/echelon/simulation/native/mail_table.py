@@ -1,7 +1,8 @@
 """Letters of a kernel: what the network decides of them, some steps ahead, and their numbers."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, TypeAlias, final
+from functools import partial
+from typing import Any, NamedTuple, TypeAlias, final
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ from echelon.core.compiled import cached_jit
 from echelon.core.types import Array, PyTree
 from echelon.simulation.codegen import Letters, aligned
 from echelon.simulation.native.blocks import FormationBlocks, Places, link_slots
+from echelon.simulation.native.network_table import NetworkTable, stacked
 from echelon.simulation.step.deliveries import Empty, Radio, deliver, empty
 from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.networks import LateNetwork
@@ -19,12 +21,29 @@ from echelon.simulation.step.records import Messages
 
 _AHEAD, _AT_ONCE = 64, 4_000_000
 """Steps that are decided at once, and numbers of them at most."""
-_Decided: TypeAlias = tuple[jax.Array, jax.Array, jax.Array]
+
+
+class _Decided(NamedTuple):
+    """What is decided of F formations in a step.
+
+    Attributes:
+        links, packets: places (F, K) and (F, N) in the ring of what comes by each link, and of what
+            brings each agent a newer packet; -1 for none.
+        leads: who leads (F, N), as `BlockRows.lead`, if anybody takes the lead.
+        weights: of links (F, K), and behind them which agents (F, N) use none, if agents choose.
+    """
+
+    links: jax.Array
+    packets: jax.Array
+    leads: jax.Array
+    weights: jax.Array
+
+
 _Step: TypeAlias = Callable[[Empty, jax.Array], tuple[Empty, _Decided]]
 
 
 @final
-class MailTable:
+class MailTable(NetworkTable):
     """The letters in flight and those that were received, of F formations.
 
     Args:
@@ -51,13 +70,9 @@ class MailTable:
         one = self.one = places.swarm if isinstance(places, FormationBlocks) else places
         self.slots, self.links = link_slots(self.loop, one), links
         self.lanes, self.blocks = places.lanes, places.blocks // places.groups
-        many, agents = len(self.slots) + self.blocks, self.loop.agents
+        agents, rows = self.loop.agents, letters.slots * self.blocks
         self.ahead = max(1, min(_AHEAD, _AT_ONCE // (self.count * (self.links + agents))))
-        self.arrivals = aligned((self.ahead, places.groups, many, self.lanes), np.int32)
-        rows = letters.slots * self.blocks
-        self.ring = aligned((places.groups, rows, letters.size, self.lanes), dtype)
-        self.mail = aligned((places.groups, len(self.slots), len(letters.kept), self.lanes), dtype)
-        self.sends = np.empty(self.ahead, np.int64)
+        self._reserve(rows, dtype)
         # Agent and row of each letter in the ring, and where an agent's is in a row.
         grid = one.agents.reshape(self.blocks, -1)
         self.senders = (np.arange(letters.slots)[:, None, None] * agents + grid).reshape(rows, -1)
@@ -69,6 +84,18 @@ class MailTable:
         self.link_place = np.zeros(links, int)
         self.link_place[self.slots[self.slots >= 0]] = np.flatnonzero(self.slots >= 0)
 
+    def _reserve(self, rows: int, dtype: np.dtype) -> None:
+        ahead, groups, lanes, letters = self.ahead, self.places.groups, self.lanes, self.letters
+        slots = len(self.slots)
+        many = slots + self.blocks
+        self.arrivals = aligned((ahead, groups, many, lanes), np.int32)
+        # Of no numbers where weights stay.
+        self.weights = aligned((ahead, groups, many * letters.chosen, lanes), dtype)
+        self.ring = aligned((groups, rows, letters.size, lanes), dtype)
+        self.mail = aligned((groups, slots, len(letters.kept), lanes), dtype)
+        self.changing = self.ring, self.mail
+        self.sends = np.empty(ahead, np.int64)
+
     def clear(self) -> None:
         """Begin before the first message."""
         self.now = self.after = self.start()
@@ -77,19 +104,10 @@ class MailTable:
 
     def forget(self, loops: Sequence[Loop]) -> None:
         """Continue with loops that may have other numbers."""
-        loop = loops[0]
-        flat = [jax.tree.leaves((each.network, each.roster)) for each in loops]
-        tree = jax.tree.structure((loop.network, loop.roster))
-        # What differs, such as keys, has an axis of formations.
-        differs = [len({np.asarray(x).tobytes() for x in leaves}) > 1 for leaves in zip(*flat)]
-        stacked = [
-            np.stack([np.asarray(x) for x in leaves]) if own else leaves[0]
-            for own, leaves in zip(differs, zip(*flat, strict=True), strict=True)
-        ]
-        network, roster = tree.unflatten(stacked)
+        loop, parts = loops[0], [(each.network, each.roster) for each in loops]
+        (network, roster), (axes, of_roster) = stacked(parts)
         self.radio = Radio(network, loop.graph, roster, np.asarray(loop.motion.dt))
-        network, roster = tree.unflatten([0 if own else None for own in differs])
-        self.axes = Radio(network, None, roster, None)  # type: ignore[arg-type]
+        self.axes = Radio(axes, None, of_roster, None)  # type: ignore[arg-type]
 
     # ---- what is decided ----
 
@@ -108,9 +126,11 @@ class MailTable:
         later = self.changes[self.changes > step]
         return int(later[0] if len(later) else self.until) - step
 
-    def leading(self, step: int) -> Array:
-        """Return of each agent that may lead whether it does, (F N, k), as `BlockRows.lead`."""
-        return self.leads[:, step - self.first].reshape(self.count * self.loop.agents, -1)
+    def rows(self, step: int) -> dict[str, Array]:
+        """Return of each agent whether it leads, if that changes."""
+        self.left(step)
+        lead = self.leads[:, step - self.first]
+        return {"lead": lead.reshape(self.count * self.loop.agents, -1)}
 
     def _decide(self, step: int) -> None:
         # What is in flight at the first step is kept, so that a moment can be had at any later one.
@@ -118,28 +138,46 @@ class MailTable:
         far = self.blocks * self.letters.size * self.lanes
         numbers = np.asarray(step, np.int32), self.place, np.asarray(far, np.int32)
         self.after, decided = _decided(self.radio, self.axes, self.now, *numbers, self.ahead)
-        links, packets, self.leads = (np.asarray(part).swapaxes(0, 1) for part in decided)
+        links, packets, self.leads, weights = (np.asarray(part).swapaxes(0, 1) for part in decided)
         changed = (np.diff(self.leads, axis=1) != 0).any(axis=(0, 2))
         self.changes = step + 1 + np.flatnonzero(changed)
         slots = len(self.slots)
         self.arrivals[:, :, :slots] = self._placed(links, self.slots)
         agents = self.one.agents.reshape(self.blocks, -1)
         self.arrivals[:, :, slots:] = self._placed(packets, agents)
+        if self.letters.chosen:
+            of_links, alone = np.split(weights, [self.links], axis=2)
+            of_links = self._in_steps(of_links, self.slots)
+            self.weights[:, :, :slots] = np.where(self.slots >= 0, of_links, 0.0)
+            self.weights[:, :, slots:] = self._in_steps(alone, agents)
         medium, steps = self.medium, step + np.arange(self.ahead)
         number, every = steps // int(medium.every), int(medium.every)
         self.sends[:] = np.where(steps % every == 0, number % medium.slots, -1)
 
     def _placed(self, values: Array, which: Array) -> Array:
         """Return places (F, T, X) in the ring of some of them, (T, groups, B, lanes)."""
-        blocks = self._to_blocks(values.swapaxes(1, 2), which).transpose(2, 0, 1, 3)
+        blocks = self._in_steps(values, which)
         if not self.places.batched:
             return np.where(which >= 0, blocks, -1)
         return np.where(blocks >= 0, blocks + np.arange(self.lanes, dtype=np.int32), blocks)
 
-    def of(self, step: int) -> tuple[Array, Array]:
-        """Return what arrives from a step on, and what is sent."""
+    def _in_steps(self, values: Array, which: Array) -> Array:
+        """Return some of values (F, T, X) in blocks of each step, (T, groups, B, lanes)."""
+        return self._to_blocks(values.swapaxes(1, 2), which).transpose(2, 0, 1, 3)
+
+    def arguments(self, step: int) -> tuple[dict[str, Array], dict[str, int]]:
+        """Return the letters, which arrive, which are sent, and the weights of links."""
         self.left(step)
-        return self.arrivals[step - self.first], self.sends[step - self.first :]
+        passed = step - self.first
+        arrays = {"ring": self.ring, "mail": self.mail, "arrivals": self.arrivals[passed]}
+        values = {
+            "sends": self.sends[passed:].ctypes.data,
+            "arrivals_step": arrays["arrivals"].size,
+        }
+        if self.letters.chosen:
+            arrays["weights"] = self.weights[passed]
+            values["weights_step"] = self.weights[passed].size
+        return arrays, values
 
     def at(self, step: int) -> Empty:
         """Return the messages at a step, which say nothing."""
@@ -224,11 +262,9 @@ def _decided(
     row: jax.Array,
     steps: int,
 ) -> tuple[Empty, _Decided]:
-    """Return the messages after some steps, which come by each link, and which bring newer packets.
+    """Return the messages after some steps, and what is decided in each.
 
-    These two are places in the ring, (T, F, K) and (T, F, N), and -1 for none. An agent's letter
-    is at its `place` in a row, of so many numbers. The last is who leads, (T, F, N), as
-    `BlockRows.lead`, if anybody takes the lead.
+    An agent's letter is at its `place` in a row, of so many numbers.
     """
     one = _step(radio, axes, place, row)
     return jax.lax.scan(one, now, first + jnp.arange(steps, dtype=jnp.int32))
@@ -241,26 +277,41 @@ def _passed(radio: Radio, axes: PyTree, now: Empty, first: jax.Array, count: jax
     return jax.lax.fori_loop(0, count, lambda k, now: one(now, first + k)[0], now)
 
 
+def _nothing(count: int, links: int, agents: int) -> _Decided:
+    """Return that nothing comes."""
+    none = jnp.zeros((count, 0))
+    places = (jnp.full((count, size), -1, jnp.int32) for size in (links, agents))
+    return _Decided(*places, leads=none.astype(jnp.int32), weights=none)
+
+
 def _step(radio: Radio, axes: PyTree, place: jax.Array, row: jax.Array) -> _Step:
     """Return what takes a step of all formations, with what comes."""
-    senders, medium = jnp.asarray(radio.links.exchange.senders), radio.network.medium
-    changes = radio.network.leadership.changes
-
-    def one(radio: Radio, now: Empty, step: jax.Array) -> tuple[Empty, _Decided]:
-        led = now.mail.packet.leader == jnp.arange(len(place))
-        now, decided = deliver(radio, now, step)
-        letter = decided.slot.astype(jnp.int32) * row + place[senders]
-        packet = jnp.where(decided.place >= 0, letter[decided.place.astype(jnp.int32)], -1)
-        leads = jnp.where(decided.leads, 2 - led, 0).astype(jnp.int32)[: len(place) * changes]
-        return now, (jnp.where(decided.new, letter, -1), packet, leads)
+    links, network = len(radio.links.exchange.senders), radio.network
+    one = jax.vmap(partial(_of_one, place, row), (axes, 0, None))
 
     def all_(now: Empty, step: jax.Array) -> tuple[Empty, _Decided]:
-        count, sizes = len(now.mail.stamp), (len(senders), len(place), len(place) * changes)
-        nothing = tuple(jnp.full((count, k), -1, jnp.int32) for k in sizes)
-        # Where nothing arrives or is sent, and nobody takes the lead, time changes nothing.
-        busy = step % jnp.max(jnp.asarray(medium.every)) == 0
-        busy |= (now.in_flight.arrival == step).any() | changes
-        many = jax.vmap(one, (axes, 0, None))
-        return jax.lax.cond(busy, lambda: many(radio, now, step), lambda: (now, nothing))
+        nothing = _nothing(len(now.mail.stamp), links, len(place))
+        # Where nothing arrives or is sent, time changes nothing.
+        busy = step % jnp.max(jnp.asarray(network.medium.every)) == 0
+        busy |= (now.in_flight.arrival == step).any()
+        return jax.lax.cond(busy, lambda: one(radio, now, step), lambda: (now, nothing))
 
-    return all_
+    # But who takes the lead, and what is too old to be used.
+    always = network.leadership.changes or network.rules.neighbours.chooses
+    return partial(one, radio) if always else all_
+
+
+def _of_one(
+    place: jax.Array, row: jax.Array, radio: Radio, now: Empty, step: jax.Array
+) -> tuple[Empty, _Decided]:
+    """Return the messages of one formation after a step, and what is decided in it."""
+    senders, network = jnp.asarray(radio.links.exchange.senders), radio.network
+    led = now.mail.packet.leader == jnp.arange(len(place))
+    now, decided = deliver(radio, now, step)
+    letter = decided.slot.astype(jnp.int32) * row + place[senders]
+    packet = jnp.where(decided.place >= 0, letter[decided.place.astype(jnp.int32)], -1)
+    leads = jnp.where(decided.leads, 2 - led, 0).astype(jnp.int32)
+    leads = leads[: len(place) * network.leadership.changes]
+    weights = jnp.append(decided.weights, decided.alone)
+    weights = weights[: len(weights) * network.rules.neighbours.chooses]
+    return now, _Decided(jnp.where(decided.new, letter, -1), packet, leads, weights)

@@ -24,7 +24,9 @@ from echelon.simulation.native.agent_step import (
 from echelon.simulation.native.blocks import FormationBlocks, Places, SwarmBlocks, neighbour_slots
 from echelon.simulation.native.given_table import GivenTable
 from echelon.simulation.native.kernel_cache import KERNELS, LANES
+from echelon.simulation.native.lead_table import LeadTable
 from echelon.simulation.native.mail_table import MailTable
+from echelon.simulation.native.network_table import EmptyTable, NetworkTable
 from echelon.simulation.native.pair_watch import PairWatch
 from echelon.simulation.native.threads import ThreadPool
 from echelon.simulation.native.varying import VaryingNumbers
@@ -88,13 +90,13 @@ class NativeStepper(Stepper):
         row_major, weights_change = self.places.row_major, variant is not None
         apart = weights_change or any(np.any(loop.meter.spacings) for loop in loops)
         self.places.listens_first = listens_first(self.loop)
+        self.places.announces = self.loop.network.announces
         self.code, made = KERNELS.of(
             self.varying, bits, batched, row_major, weights_change, apart, self.places.shifts
         )
         _, self.rows, self.plan, self.uniform_count, self._work, self.memories, parts = made
         self.given = GivenTable(self.varying, loops, parts, self.places, self.plan, self.dtype)
-        letters = self.plan.letters
-        self.mail = letters and MailTable(loops, self.places, letters, self.dtype)
+        self.table = self._table()
         self._reserve()
         # The moment in the blocks: a chunk that continues from it need not be written there.
         self._moment: LoopState | None = None
@@ -104,6 +106,14 @@ class NativeStepper(Stepper):
         axes, count = len(self.loop.meter.paired), len(loops)
         rows = self.plan.rows
         self._pairs = PairWatch(self.places, axes, count, self.dtype, _STEPS, rows)
+
+    def _table(self) -> NetworkTable:
+        """Return what decides ahead of the kernel what its network does."""
+        if self.plan.letters is not None:
+            return MailTable(self.loops, self.places, self.plan.letters, self.dtype)
+        if self.places.announces:
+            return LeadTable(self.loops, self.places, self.plan.rows)
+        return EmptyTable()
 
     # ---- memory ----
 
@@ -169,11 +179,13 @@ class NativeStepper(Stepper):
         """Return the moment at which the run begins."""
         states = np.asarray(self.states, self.dtype)
         memory = self._memory(self._begun() if len(self.rows.memory) else states[:, :0])
-        if self.mail is not None:
-            self.mail.clear()
-            packets = np.zeros((len(states), len(self.rows.packet)))
-            memory = memory._replace(network=self.mail.memory(0, packets))
-        memory = memory._replace(roster=self.loop.roster.begin(states))
+        self.table.clear()
+        packets = np.zeros((len(states), len(self.rows.packet)))
+        others = {
+            "network": self.table.memory(0, packets),
+            "roster": self.loop.roster.begin(states),
+        }
+        memory = memory._replace(**others)
         cut = np.zeros((len(states), len(self.rows.input)), np.int8)
         return self._moment_of(0, states, memory, cut)
 
@@ -250,8 +262,7 @@ class NativeStepper(Stepper):
         self.varying.replace_loop(loop)
         self.edge_weights[:] = neighbour_slots(loop, self.places)[2]
         self.given.forget([loop])
-        if self.mail is not None:
-            self.mail.forget([loop])
+        self.table.forget([loop])
         # Offsets and numbers are written with a moment.
         self._moment = None
 
@@ -286,8 +297,7 @@ class NativeStepper(Stepper):
     def _read_next_inputs(self, step: int, first: int, table: Array | None, out: Array) -> None:
         """Read the inputs of a step that is not taken."""
         self._enter(step)
-        letters = (self.mail.ring, self.mail.mail) if self.mail is not None else ()
-        arrays = (self.blocks, self.edges, *self.mirrors, *letters, self._pairs.least)
+        arrays = (self.blocks, self.edges, *self.mirrors, *self.table.changing, self._pairs.least)
         copies = [array.copy() for array in arrays]
         self._run(step, 1, first, table)
         self._read(self.rows.input, out)
@@ -311,10 +321,9 @@ class NativeStepper(Stepper):
             count = min(steps, self._pairs.steps, max(1, most), constant)
             later = self._events[self._events > step]
             count = min(count, int(later[0]) - step) if len(later) else count
-            count = min(count, self.given.left(step))
-            if self.mail is not None:
-                count = min(count, self.mail.left(step))
-                self._write(self.rows.lead, self.mail.leading(step))
+            count = min(count, self.given.left(step), self.table.left(step))
+            for name, values in self.table.rows(step).items():
+                self._write(getattr(self.rows, name), values)
             self._call(step, count, input_step, None if table is None else table[step - first :])
             step, steps = step + count, steps - count
 
@@ -386,10 +395,8 @@ class NativeStepper(Stepper):
         if self.plan.given:
             firsts["ahead"] = self.given.of(step)
             values["ahead_step"] = firsts["ahead"].size
-        if self.mail is not None:
-            firsts |= {"ring": self.mail.ring, "mail": self.mail.mail}
-            firsts["arrivals"], sends = self.mail.of(step)
-            values |= {"sends": sends.ctypes.data, "arrivals_step": firsts["arrivals"].size}
+        for all_, own in zip((firsts, values), self.table.arguments(step), strict=True):
+            all_ |= own
         firsts["pairs"], values["pair_count"] = self._pairs.least, self._pairs.least.shape[1]
         values["pair_ends"] = self._pairs.ends.ctypes.data
         tape = self._pairs.room(step, steps)
@@ -450,8 +457,7 @@ class NativeStepper(Stepper):
             self._write_mirror(mirror_values(self.loops, now, x, offsets, shown))
         memory = now.memory
         self._write(rows.memory, self._rows_of(memory.laws, memory.sensing, memory.plant))
-        if self.mail is not None:
-            self._write(rows.packet, self.mail.load(int(now.step), memory.network))
+        self._write(rows.packet, self.table.load(int(now.step), memory.network))
         if len(rows.agent):
             leaves = [
                 np.concatenate(part) for part in zip(*map(agent_rows, self.loops), strict=True)
@@ -492,11 +498,10 @@ class NativeStepper(Stepper):
     def _whole(self, step: int, x: Array, memory: Array, cut: Array) -> LoopState:
         """Return the moment at a step of these, and of what else is in the blocks."""
         whole, packet = self._memory(memory), self.rows.packet
-        if self.mail is not None:
-            packets = self._read(packet, np.empty((len(x), len(packet)), self.dtype))
-            whole = whole._replace(network=self.mail.memory(step, packets))
+        packets = self._read(packet, np.empty((len(x), len(packet)), self.dtype))
         starts = self.loop.roster.begin(np.asarray(self.states, self.dtype))
-        return self._moment_of(step, x, whole._replace(roster=starts), cut.astype(np.int8))
+        whole = whole._replace(network=self.table.memory(step, packets), roster=starts)
+        return self._moment_of(step, x, whole, cut.astype(np.int8))
 
     def _find_inexact(self) -> None:
         """Note the formations whose numbers are not what JAX computes."""

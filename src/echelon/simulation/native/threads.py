@@ -19,7 +19,7 @@ from typing import Any, TypeVar, final
 import numpy as np
 
 from echelon.core.types import Array
-from echelon.simulation.codegen import SLOTS, TASK, Code, aligned, copy_rows
+from echelon.simulation.codegen import ANNOUNCE, PRIOR, SLOTS, TASK, Code, aligned, copy_rows
 from echelon.simulation.native.blocks import BlockReach, Places
 
 _SHARED, _WORTH = 20_000, 100_000
@@ -138,8 +138,8 @@ class ThreadPool:
                 tasks = tile_by_tile(segments, reach, steps, thread, self.threads)
             else:
                 edges = self.places.edge_blocks
-                prior = self.places.listens_first
-                tasks = step_by_step(segments, edges, steps, thread, self.threads, prior)
+                prior = self.places.listens_first, self.places.announces
+                tasks = step_by_step(segments, edges, steps, thread, self.threads, *prior)
             self._schedules[steps, thread] = tasks
         return self._schedules[steps, thread]
 
@@ -183,7 +183,13 @@ _DEEP = 4
 
 
 def step_by_step(
-    segments: Array, edges: int, steps: int, thread: int, threads: int, prior: bool = False
+    segments: Array,
+    edges: int,
+    steps: int,
+    thread: int,
+    threads: int,
+    prior: bool = False,
+    announces: bool = False,
 ) -> Array:
     """Return the tasks (T, 8) of a thread that takes its part of each level at each step.
 
@@ -194,10 +200,12 @@ def step_by_step(
         thread: the index of the thread.
         threads: the number of threads; they wait for each other after each level.
         prior: whether all blocks first do what is before any agent acts.
+        announces: whether leaders then announce what they do.
     """
-    ends = np.stack([segments[:-1], segments[1:]])
-    ends = np.insert(ends, 0, (0, segments[-1]), axis=1) if prior else ends
-    levels = np.arange(ends.shape[1]) - prior
+    before = [(PRIOR, 0, segments[-1])] * prior + [(ANNOUNCE, 0, segments[1])] * announces
+    count = len(segments) - 1
+    rows = np.array(before, int).reshape(-1, 3), np.c_[:count, segments[:-1], segments[1:]]
+    levels, *ends = np.concatenate(rows).T
     by_level = np.zeros((steps, len(levels), len(TASK)), np.int64)
     by_level[..., 0], by_level[..., 1] = np.arange(steps)[:, None], levels
     for k in (0, 1):

@@ -7,13 +7,55 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
 from echelon.core.types import Array
-from echelon.simulation.step.leadership import NOBODY
+from echelon.simulation.step.leadership import NOBODY, FixedLeaders, announced
 from echelon.simulation.step.networks import LateNetwork, carries
-from echelon.simulation.step.records import Messages, NetworkEstimate, Steps
+from echelon.simulation.step.records import (
+    Clock,
+    Known,
+    LeaderPackets,
+    Messages,
+    NetworkEstimate,
+    Steps,
+)
 from echelon.simulation.step.roster import Everybody, Links
 
 NOTHING = -1.0
 """The place of a packet that an agent has already."""
+
+
+class Announcement(NamedTuple):
+    """Who announces to all others what it does in a step of the ideal network with backup leaders.
+
+    Attributes:
+        packets: of the agents after it.
+        leads: (N,) who leads.
+        place: (N,) whom each receives, by its place among those that may lead; `NOTHING` of none.
+    """
+
+    packets: LeaderPackets
+    leads: Bool[jax.Array, " N"]
+    place: Float[jax.Array, " N"]
+
+
+def announce(
+    leadership: FixedLeaders,
+    roster: Everybody,
+    leaders: Array,
+    packets: LeaderPackets,
+    clock: Clock,
+) -> Announcement:
+    """Return what the ideal network decides in a step: who leads, and whom agents receive.
+
+    `leaders` are the numbers of those that may lead, and packets say nothing.
+    """
+    number, here = jnp.arange(len(packets.stamp), dtype=jnp.int32), roster.here(clock.step)
+    packets = packets._replace(content=jnp.full((len(number), 1), NOTHING))
+    packets = leadership.elect(packets, number, clock, roster.since(clock.step), here)
+    leads = leadership.leads(packets, number)
+    # The content of a packet is the place of its sender.
+    places = jnp.arange(len(leaders), dtype=float)[:, None]
+    packets = announced(leadership, packets, leaders, leads, here, clock, places)
+    return Announcement(packets, leads, packets.content[:, 0])
 
 
 class Radio(NamedTuple):
@@ -42,6 +84,7 @@ class Delivery(NamedTuple):
         used: (K,) whose messages agents use.
         sends: (K,) along which messages leave.
         ages: (K,) of the messages, s.
+        weights, alone: (K,) of the links in what agents receive, and (N,) which use none of them.
     """
 
     new: Bool[jax.Array, " K"]
@@ -52,6 +95,8 @@ class Delivery(NamedTuple):
     used: Bool[jax.Array, " K"]
     sends: Bool[jax.Array, " K"]
     ages: Float[jax.Array, " K"]
+    weights: Float[jax.Array, " K"]
+    alone: Bool[jax.Array, " N"]
 
 
 def empty(network: LateNetwork, links: int) -> Empty:
@@ -86,5 +131,10 @@ def deliver(radio: Radio, now: Empty, step: jax.Array) -> tuple[Empty, Delivery]
     messages, sends = rules.write(mail, heard, number, step, *silent)
     after = network.posted(now.in_flight, step, messages, sends, links)
     itself, carried = packet.leader == number, carries(links, sends)
-    decided = new, slot, packet.content[:, 0], leads, itself, used, carried, ages
+    knows = leads | (clock.age(packet.stamp) < jnp.inf)
+    nobody: Any = None
+    known = Known(clock, here, nobody, nobody, silence, links)
+    fresh = rules.chosen(mail, ages, hops, silence, knows, known)[1]
+    shares = rules.neighbours.shares(fresh, links, rules.agents)
+    decided = new, slot, packet.content[:, 0], leads, itself, used, carried, ages, *shares
     return Empty(after, mail), Delivery(*decided)

@@ -210,6 +210,38 @@ class Failover(FixedLeaders):
         return (rank != _NO_BACKUP) & (jnp.asarray(leader) != number) & late
 
 
+def announced(
+    leadership: FixedLeaders,
+    packet: LeaderPackets,
+    leaders: Array,
+    leads: jax.Array,
+    here: Mask,
+    clock: Clock,
+    content: Float[jax.Array, "L k"],
+) -> LeaderPackets:
+    """Return the packets of N agents after those that lead reach everybody with theirs.
+
+    Args:
+        leadership: of the formation.
+        packet: of the agents.
+        leaders: the numbers of those that may lead.
+        leads: (N,) who does.
+        here: who is there: all others neither send nor receive.
+        clock: of the step.
+        content: of the packets of those that may lead.
+    """
+    agents, number = len(packet.stamp), jnp.asarray(leaders)
+    here = as_array(here, agents)
+    leads = leads & here
+    stamp = jnp.full(len(number), clock.now, jnp.int32)
+    own = LeaderPackets(packet.leader[number], stamp, content, packet.term[number])
+    each = jax.tree.map(lambda part: jnp.repeat(part, agents, axis=0), own)
+    receivers = jnp.tile(jnp.arange(agents), len(number))
+    new = jnp.repeat(leads[number], agents) & here[receivers]
+    everywhere = Exchange(receivers, receivers, jnp.zeros(0))
+    return leadership.newest(packet, each, new, everywhere)
+
+
 def leaders_of(graph: Graph, leadership: Leadership | None) -> FixedLeaders:
     """Return who leads in a run."""
     first = np.isin(np.arange(graph.agents), graph.leaders)

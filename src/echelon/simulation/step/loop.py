@@ -43,8 +43,9 @@ class IdealNetwork(eqx.Module):
     """
 
     leadership: FixedLeaders
-    # Whether messages take time.
+    # Whether messages take time, and whether those that lead announce to all what they do.
     late = False
+    announces = False
 
     def begin(self, loop: "Loop", said: Float[jax.Array, "N s"], forward: int) -> PyTree:
         """Return the memory before the first message, for a feed-forward (forward,)."""

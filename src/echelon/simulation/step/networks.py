@@ -50,6 +50,8 @@ its motion slows down afterwards."""
 class IdealWithBackups(IdealNetwork):
     """Packets of leaders reach all agents at once; it remembers each agent's."""
 
+    announces = True
+
     def begin(self, loop: Loop, said: Float[jax.Array, "N s"], forward: int) -> PyTree:
         """Return the packets before the first one."""
         content = jnp.zeros((len(said), forward), said.dtype)
@@ -287,6 +289,9 @@ def carried_time(age: Scalar) -> Scalar:
 class AllNeighbours(eqx.Module):
     """Whom agents use of those who send to them: all."""
 
+    # Whether the weights of links depend on what arrives.
+    chooses = False
+
     def uses(self, mail: Messages, hops: jax.Array, links: Exchange) -> jax.Array | bool:
         """Return which links (K,) an agent uses whose messages are fresh."""
         return True
@@ -297,10 +302,18 @@ class AllNeighbours(eqx.Module):
         """Return z (N, s), of which `alone` (N, s) is of an agent without fresh messages (K,)."""
         return known.links(known.said, received, loop.laws.speech.difference(loop.model))
 
+    def shares(
+        self, fresh: jax.Array, links: Exchange, agents: int
+    ) -> tuple[Float[jax.Array, " K"], Bool[jax.Array, " N"]]:
+        """Return the weights of links (K,) in z, and which agents (N,) use none of them."""
+        return jnp.asarray(links.weights), jnp.zeros(agents, bool)
+
 
 @final
 class LeaderwardNeighbours(AllNeighbours):
     """Those with fewer hops to the leader alone."""
+
+    chooses = True
 
     def uses(self, mail: Messages, hops: jax.Array, links: Exchange) -> jax.Array | bool:
         """Return which links (K,) an agent uses whose messages are fresh."""
@@ -312,6 +325,12 @@ class LeaderwardNeighbours(AllNeighbours):
         """Return the mean over the links that are used."""
         difference = loop.laws.speech.difference(loop.model)
         return known.links.mean(known.said, received, fresh, alone, difference)
+
+    def shares(
+        self, fresh: jax.Array, links: Exchange, agents: int
+    ) -> tuple[Float[jax.Array, " K"], Bool[jax.Array, " N"]]:
+        """Return the weights of links (K,) in this mean, and which agents (N,) use none of them."""
+        return links.shares(fresh, agents)
 
 
 # ---- the rules of messages -----------------------------------------------------------------------
@@ -381,12 +400,30 @@ class MessageRules(eqx.Module):
         leader = jnp.where((itself | ~aware)[:, None], known.said, leader)
         forward = jnp.where(aware[:, None], forward, 0.0)
         hops, knows = self.hops(mail, age, leads, links, clock.dt), leads | aware
-        received, fresh = self.received(mail, age, leader, knows, known)
-        fresh = fresh & self.neighbours.uses(mail, hops, links)
-        off = loop.laws.speech.difference(loop.model)(known.said, leader)
-        alone = jnp.where(knows[:, None], off, 0.0)
+        received, fresh = self.chosen(mail, age, hops, leader, knows, known)
+        alone = self.alone(loop, known.said, leader, knows)
         z = self.neighbours.disagreement(known, received, fresh, alone, loop)
         return NetworkEstimate(z, leads, forward, leader, hops, packet)
+
+    def alone(
+        self, loop: Loop, said: Float[jax.Array, "N s"], leader: jax.Array, knows: jax.Array
+    ) -> Float[jax.Array, "N s"]:
+        """Return z (N, s) of agents that use no message: how far off they expect the leader."""
+        off = loop.laws.speech.difference(loop.model)(said, leader)
+        return jnp.where(knows[:, None], off, 0.0)
+
+    def chosen(
+        self,
+        mail: Messages,
+        age: jax.Array,
+        hops: jax.Array,
+        leader: jax.Array,
+        knows: jax.Array,
+        known: Known,
+    ) -> tuple[Float[jax.Array, "K s"], Bool[jax.Array, " K"]]:
+        """Return the signal of the sender of each link, and which links agents use."""
+        received, fresh = self.received(mail, age, leader, knows, known)
+        return received, fresh & self.neighbours.uses(mail, hops, known.links)
 
     def received(
         self, mail: Messages, age: jax.Array, leader: jax.Array, knows: jax.Array, known: Known

@@ -8,20 +8,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from echelon.agents.network.exchange import Exchange, Near
+from echelon.agents.network.exchange import Near
 from echelon.agents.network.graph import Graph
 from echelon.core.types import Array, PyTree, State
 from echelon.laws.law import Law, LocalView, Memory
+from echelon.simulation.step.leadership import announced
 from echelon.simulation.step.loop import Loop, Turns
 from echelon.simulation.step.records import (
     AgentOutput,
     GroupOffsets,
     Known,
     LawMemories,
-    LeaderPackets,
     LeaderSpeech,
     Played,
-    as_array,
     choose,
 )
 
@@ -170,16 +169,8 @@ class Announced(Relay):
         self, loop: Loop, known: Known, network: PyTree, said: AgentOutput
     ) -> tuple[Float[jax.Array, "N k"], PyTree]:
         """Return what each agent is sent, and the packets."""
-        agents, number = loop.agents, jnp.asarray(loop.laws.leaders)
-        here = as_array(known.here, agents)
-        leads = known.heard.leads & here
-        stamp = jnp.full(len(number), known.clock.now, jnp.int32)
-        own = LeaderPackets(network.leader[number], stamp, said.message, network.term[number])
-        each = jax.tree.map(lambda part: jnp.repeat(part, agents, axis=0), own)
-        receivers = jnp.tile(jnp.arange(agents), len(number))
-        new = jnp.repeat(leads[number], agents) & here[receivers]
-        everywhere = Exchange(receivers, receivers, jnp.zeros(0))
-        packet = loop.network.leadership.newest(network, each, new, everywhere)
+        rows = loop.laws.leaders, known.heard.leads, known.here, known.clock, said.message
+        packet = announced(loop.network.leadership, network, *rows)
         return packet.content, packet
 
 
