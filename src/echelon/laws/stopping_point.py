@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import math
 from typing import final
 
 import equinox as eqx
@@ -30,7 +29,8 @@ from echelon.laws.unlike_loop import UnlikeLoop
 
 _LINEAR = 1e-8
 """Of c |x| / s; below it sigma is linear to rounding."""
-_LN2 = math.log(2.0)
+_NEARLY_ONE = -0.5
+"""Of coth a - a; below it coth a is so near to 1 that a guess of a may take it for 1."""
 
 
 def saturated_decay(
@@ -38,24 +38,26 @@ def saturated_decay(
 ) -> jax.Array:
     """Return x after a time (s) of x' = -sigma(c x), sigma(x) = x / sqrt(1 + (x/s)^2), entrywise.
 
-    With v = c |x| / s the function F(v) = sqrt(1 + v^2) - arsinh(1/v) falls by c per second.
+    With sinh a = s / (c |x|) the function coth a - a falls by c per second.
 
     `inverse` is 1/s of each entry, 0 where sigma is linear; `age` is in s.
     """
     v = coupling * jnp.abs(start) * inverse
     linear = v < _LINEAR
     v = jnp.where(linear, 1.0, v)
-    target = _fallen(v) - coupling * age
-    # F is above ln v and above v - 1 or so; from there Newton's method in ln v has all digits soon.
-    guess = jnp.where(target >= 1.0, jnp.log(jnp.maximum(target, 1.0)), target - 1.0 + _LN2)
-    for _ in range(4):
-        now = jnp.exp(guess)
-        guess = guess - (_fallen(now) - target) / jnp.sqrt(1.0 + now**2)
-    return start * jnp.where(linear, jnp.exp(-coupling * age), jnp.exp(guess) / v)
-
-
-def _fallen(v: jax.Array) -> jax.Array:
-    return jnp.sqrt(1.0 + v**2) - jnp.arcsinh(1.0 / v)
+    coth = jnp.sqrt(1.0 + v * v)
+    target = coth - jnp.log((1.0 + coth) / v) - coupling * age
+    # coth a is 1/a + a/3 or so, and 1 of a large a: within a tenth. Halley's method makes of that
+    # 1e-4, and then all digits.
+    root = jnp.sqrt(target * target + 8.0 / 3.0)
+    small = jnp.where(target > 0.0, 2.0 / (target + root), 0.75 * (root - target))
+    a = jnp.where(target > _NEARLY_ONE, small, 1.0 - target)
+    for _ in range(2):
+        below = -jnp.expm1(-2.0 * a)
+        coth = (2.0 - below) / below
+        off = coth - a - target
+        a = a + off * coth / (coth**3 - off * (coth * coth - 1.0))
+    return start * jnp.where(linear, jnp.exp(-coupling * age), 1.0 / (v * jnp.sinh(a)))
 
 
 # ---- the law -------------------------------------------------------------------------------------
