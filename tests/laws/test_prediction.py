@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 import echelon as ech
+from echelon.core.numerics import precision
 from echelon.laws.law import Speaks
 from echelon.laws.stopping_point import saturated_decay
 
@@ -64,3 +65,23 @@ def test_a_leader_on_its_plan_is_expected_where_it_is(name):
                 np.testing.assert_allclose(
                     there.feedforward, leader.ready.stop(path[1:]), atol=1e-12
                 )
+
+
+@pytest.mark.parametrize("kind", ["float32", "float64"])
+def test_of_a_decay_all_digits_are_left_at_any_age(kind):
+    """By F(v) = sqrt(1 + v^2) - arsinh(1/v), which falls by c per second, v = c |x| / s."""
+    draws = np.random.default_rng(0)
+    v, falls = 10.0 ** draws.uniform(-7.5, 5.0, 2_000), 10.0 ** draws.uniform(-3.0, 1.7, 2_000)
+    with precision(kind):
+        rows = jnp.asarray(v)[:, None], jnp.asarray(falls)
+        decay = jax.vmap(lambda v, age: saturated_decay(v, 1.0, jnp.ones(1), age))
+        left = np.asarray(decay(*rows), float)[:, 0]
+
+    def fallen(v):
+        return np.sqrt(1.0 + v * v) - np.log((1.0 + np.sqrt(1.0 + v * v)) / v)
+
+    # What rounding of v at the start, of F and of the age makes of it, in float64 at most 1e-13.
+    eps = float(np.finfo(kind).eps)
+    before = fallen(np.asarray(v, kind).astype(float))
+    off = np.abs(fallen(left) - before + np.asarray(falls, kind).astype(float))
+    np.testing.assert_array_less(off, 16.0 * eps * (1.0 + np.abs(before) + falls))
