@@ -755,15 +755,28 @@ def test_formations_over_a_radio_are_those_alone_with_draws_of_their_own(hears):
     assert np.ptp([one.states[-1, 1:] for one in flown], axis=0).min() > 0.0
 
 
-def test_formations_whose_backups_wait_for_other_times_are_those_alone():
+@pytest.mark.parametrize("coupling", [1.0, pytest.param(None, marks=pytest.mark.slow)])
+def test_formations_whose_backups_wait_for_other_times_are_those_alone(coupling):
     chosen = run_settings(dt=0.02, horizon=3.0, store_every=10, engine="native")
     times = 0.1 + 0.04 * np.arange(9)
     waiting = (ech.Leadership((1, 2), timeout=time) for time in times)
-    runs = [(carts(coupling=1.0, events=BOTH, leadership=each), chosen) for each in waiting]
+    runs = [(carts(coupling=coupling, events=BOTH, leadership=each), chosen) for each in waiting]
     flown = [*Batch(1).fly(runs)]
     for one, run in zip(flown, runs, strict=True):
         np.testing.assert_array_equal(one.states, ech.simulate(*run).states)
     assert len({one.states.tobytes() for one in flown}) == len(runs)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sets", [(), ("network.prediction=packet",)])
+def test_a_flight_has_the_same_bits_beside_others_whose_motors_are_at_their_limits(sets):
+    """Of a block of formations all take the steps in full if one of them must."""
+    far = "initial={spread: {position: 30.0, attitude: 0.8, velocity: 5.0}}"
+    parts, chosen = ech.build(ech.load_scenario("paper-radio", [far, *sets]))
+    chosen = chosen._replace(horizon=2.0, steady_window=None, store_every=20, engine="native")
+    runs = [(parts, chosen._replace(seed=seed)) for seed in range(9)]
+    for one, run in zip(Batch(1).fly(runs), runs, strict=True):
+        np.testing.assert_array_equal(one.states, ech.simulate(*run).states)
 
 
 @pytest.mark.parametrize(

@@ -147,7 +147,7 @@ POSITIVE = [1e-300, 0.3, 0.5, math.sqrt(0.5), 0.999, 1.0, 2.0, 1.414, 1.4143, 3e
 DOMAINS = {"pow2": WHOLE, "bit0": SHIFTED, "bit1": SHIFTED}
 DOMAINS |= dict.fromkeys(("exponent", "mantissa", "root_guess"), POSITIVE)
 DOMAINS["single"] = [x for x in SPECIAL if not abs(x) > 1e39 or math.isinf(x)]
-LOGICAL = {"and": 2, "or": 2, "xor": 2, "not": 1, "unlikely": 1}
+LOGICAL = {"and": 2, "or": 2, "xor": 2, "not": 1, "unlikely": 1, "rare": 1}
 ARITY = {"copysign": 2, "min": 2, "max": 2, "fma": 3, "fms": 3, "fnma": 3, "select": 3}
 UNARY = {"neg", "abs", "sqrt", "floor", "ceil", "rint", *DOMAINS}
 

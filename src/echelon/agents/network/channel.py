@@ -182,16 +182,13 @@ class Network(WorldPart):
                 "`safety` over a network needs the messages `deviation` and the prediction "
                 f"`preview`, and got `{self.messages}` and `{self.prediction}`."
             )
+        preview = "`prediction` of the network is `preview`, and"
         if self._by_plan and not laws.plans:
-            yield (
-                "`prediction` of the network is `preview`, and a leader under the law "
-                f"`{leader.__name__}` has no plan; use `packet`."
-            )
+            yield f"{preview} a leader under the law `{leader.__name__}` has no plan; use `packet`."
         if self._by_plan and not laws.speak_alike:
             yield (
-                "`prediction` of the network is `preview`, and followers under the law "
-                f"`{follower.__name__}` do not send what the plan of a leader under "
-                f"`{leader.__name__}` is about; use `packet`."
+                f"{preview} followers under the law `{follower.__name__}` do not send what the plan"
+                f" of a leader under `{leader.__name__}` is about; use `packet`."
             )
 
     @property

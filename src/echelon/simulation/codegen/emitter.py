@@ -5,9 +5,9 @@ side of a choice needs is behind a branch, taken if any lane takes that side.
 
 Much of a step is written for unlikely cases: an angle beyond 45 degrees, a motor at its limit. A
 truth marked as `unlikely` may always be assumed to hold, because what it then selects is correct
-for every number; while it does not hold, it may be assumed not to hold. So a step is written twice:
-without the unlikely cases, the fast path, and in full. The first is tried, and left for the second
-if a lane needs it. Both compute the same bits.
+for every number; while it does not hold, it may be assumed not to hold. One that is `rare` selects
+other last bits. So a step is written twice: without such cases, the fast path, and in full. The
+first is tried, and left for the second if a lane needs it. Both compute the same bits.
 """
 
 import graphlib
@@ -282,21 +282,27 @@ class FastPath(NamedTuple):
 
 
 def general_case(results: Sequence[Node]) -> Mapping[Node, Node]:
-    """Return each node with every unlikely truth assumed to hold, which is always correct."""
-    return rewritten(results, lambda node, args: True if node.op == "unlikely" else None)
+    """Return each node with every unlikely truth assumed to hold, and rare ones computed."""
+
+    def plain(node: Node, args: Sequence[Node]) -> Node | bool | None:
+        if node.op == "rare":
+            return args[0]
+        return True if node.op == "unlikely" else None
+
+    return rewritten(results, plain)
 
 
 def find_fast_path(results: Sequence[Node], choices: Iterable[tuple[Node, bool]]) -> FastPath:
-    """Return each node with every unlikely truth assumed not to hold, `choices` included."""
+    """Return each node with unlikely and rare truths assumed not to hold, nor `choices`."""
     sides, depths, excluded = dict(choices), dict[Node, int](), list[tuple[int, Node]]()
 
     def assume(node: Node, args: Sequence[Node]) -> Node | bool | None:
         # What is the same for all agents costs almost nothing, and is computed in full.
         depth = max((depths[a] for a in node.args), default=0)
         depths[node] = depth
-        if node.op == "unlikely":
+        if node.op in ("unlikely", "rare"):
             if node.uniform:
-                return True
+                return True if node.op == "unlikely" else args[0]
             excluded.append((depth, args[0]))
             depths[node] = depth + 1
             return False

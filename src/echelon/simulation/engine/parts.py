@@ -195,20 +195,18 @@ class Starts:
         self.states: np.ndarray | None = None
         self.named: dict[int, ArrayLike] = {}
         if initial is not None and not isinstance(initial, Mapping):
-            self.states = read_states(
-                initial, self.shape, "initial states have", "(agents, states)"
-            )
+            what = "initial states have", "(agents, states)"
+            self.states = read_states(initial, self.shape, *what)
             # The caller's states are where leaders belong; the error is added to them.
             self.states[list(graph.leaders)] += self.error
             return
         named = dict(initial or {})
-        spreads = {key: value for key, value in named.items() if isinstance(key, str)}
+        spreads = {k: value for k, value in named.items() if isinstance(k, str)}
         self.spread = _per_state(model, spreads, "initial spread")
-        self.named = {key: value for key, value in named.items() if not isinstance(key, str)}
-        # Whatever the caller computes in: one who asked in float32 had goals that are .1 um off.
-        with precision("float64"):
-            leaders = np.asarray(parts.drive.start(model), np.float64) + self.error
-            self.goals = leaders + parts.formation.offsets_at([0.0])[0]
+        self.named = {k: value for k, value in named.items() if not isinstance(k, str)}
+        with precision("float64"):  # in float32 goals are .1 um off
+            leaders = parts.drive.start(model) + self.error
+            self.goals = np.asarray(leaders) + parts.formation.offsets_at([0.0])[0]
         if isinstance(model, UnlikeAgents):
             model.check_goals(self.goals)
 

@@ -176,21 +176,20 @@ class Kernels:
         shifts: Shifts = ((), ()),
     ) -> Kernel:
         """Return the kernel of loops, `weighted` if weights may change; as `plan_of`."""
-        signature = varying.signature
+        loop, signature = varying.loop, varying.signature
+        options = bits, batched, row_major, weighted, apart, shifts
         # Also by what has rows of agents, only if it exists.
-        own = jax.tree.structure((varying.loop.places, varying.loop.motion.rows))
-        key = (signature, own, bits, LANES[bits], batched, row_major, weighted, apart, shifts)
+        own = jax.tree.structure((loop.places, loop.motion.rows))
+        key = signature, own, LANES[bits], *options
 
         def write() -> KernelText:
-            loop = varying.loop
             memories = memories_of(loop)
             rows = BlockRows.of(loop, memories, varying.count)
-            parts = plan_of(varying, rows, bits, batched, row_major, weighted, apart, shifts)
-            return text_of(rows, *parts, memories)
+            return text_of(rows, *plan_of(varying, rows, *options), memories)
 
         def make() -> Kernel:
-            rows = varying.loop.places, varying.loop.motion.rows
             # To trace a step takes longer than to read its text; numbers given ahead are no text.
+            rows = loop.places, loop.motion.rows
             made = load_or_compute(write, "kernel", signature, rows, *key[2:])
             # By its text, since another graph has the same code.
             return Kernel(self.codes.get_or_make(made.text, lambda: Code(made.text)), made)

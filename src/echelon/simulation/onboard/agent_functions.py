@@ -231,7 +231,7 @@ def _function(
 
 def _plainer(node: Node, args: Sequence[Node]) -> Node | bool | None:
     """Return what replaces a node for one agent alone."""
-    if node.op == "unlikely":
+    if node.op in ("unlikely", "rare"):
         # Of choices that save time where many agents take the same side.
         return True
     if node.op not in ("min", "max") or node.truth:

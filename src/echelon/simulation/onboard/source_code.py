@@ -62,7 +62,7 @@ COMMON = {
     "le": "{0} <= {1}",
     "eq": "{0} == {1}",
     **dict.fromkeys(("ne", "xor"), "{0} != {1}"),
-    "unlikely": "{0}",
+    **dict.fromkeys(("unlikely", "rare"), "{0}"),
     "bit0": "law_bit({0}, 0)",
     "bit1": "law_bit({0}, 1)",
     **{name: f"law_{name}({{0}})" for name in ("abs", "sqrt", "floor", "ceil", "rint")},

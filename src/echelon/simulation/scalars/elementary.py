@@ -354,7 +354,7 @@ def rsqrt(x: Node) -> Node:
         return exact
     half, y = 0.5 * x, g.make("root_guess", x)
     # If x is 0, infinite or negative, the guess is wrong.
-    far = g.make("unlikely", less(0.05, size((half * y) * y - 0.5)))
+    far = g.make("rare", less(0.05, size((half * y) * y - 0.5)))
     # Each step maps the error e to 1.5 e^2: 0.034, 1.8e-3, 4.7e-6, 3e-11.
     for _ in range(4 if g.bits == 64 else 3):
         y = y * (1.5 - (half * y) * y)

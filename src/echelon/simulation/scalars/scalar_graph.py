@@ -64,10 +64,12 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     "single": lambda a: float(np.float32(a)),
     # A truth that may also be assumed to hold always (`codegen.fast_path`).
     "unlikely": lambda a: a,
+    # One that may not, since what it does not select has other last bits.
+    "rare": lambda a: a,
 }
-TRUTHS = {"lt", "le", "eq", "ne", "and", "or", "xor", "not", "bit0", "bit1", "unlikely"}
+TRUTHS = {"lt", "le", "eq", "ne", "and", "or", "xor", "not", "bit0", "bit1", "unlikely", "rare"}
 _COMMUTE = {"add", "mul", "min", "max", "and", "or", "xor", "eq", "ne"}
-LOGICAL = {"and", "or", "xor", "not", "unlikely"}
+LOGICAL = {"and", "or", "xor", "not", "unlikely", "rare"}
 _NEVER_FOLDED = {"exponent", "mantissa", "bit0", "bit1", "root_guess"}
 
 
