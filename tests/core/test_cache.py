@@ -465,8 +465,8 @@ def test_the_text_of_a_kernel_is_found_by_what_runs_and_never_of_somebody_s_own_
         chosen = ech.Settings(horizon=1.0, dt=0.01, engine="native", steady_window=None)
         return ech.simulate(parts, chosen).states
 
-    first, other = flown(Pendulum()), flown(Pendulum(), 0.1)
-    assert (first != other).any()
+    first, other, own = flown(Pendulum()), flown(Pendulum(), 0.1), flown(OwnPendulum())
+    assert (first != other).any() and (own == first).all()
     with monkeypatch.context() as patch:
         patch.setattr(kernel_cache, "plan_of", again)
         np.testing.assert_array_equal(flown(Pendulum()), first)

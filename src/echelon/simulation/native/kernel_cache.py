@@ -189,8 +189,8 @@ class Kernels:
 
         def make() -> Kernel:
             # To trace a step takes longer than to read its text; numbers given ahead are no text.
-            rows = loop.places, loop.motion.rows
-            made = load_or_compute(write, "kernel", signature, rows, *key[2:])
+            known = signature, loop.places, loop.motion.rows, *key[2:]
+            made = write() if signature is None else load_or_compute(write, "kernel", *known)
             # By its text, since another graph has the same code.
             return Kernel(self.codes.get_or_make(made.text, lambda: Code(made.text)), made)
 
