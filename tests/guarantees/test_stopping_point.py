@@ -14,6 +14,7 @@ from in_words import in_words
 
 import echelon as ech
 from echelon.agents.models.chains import Chains, chains_of, differentiate, look_for_chains, to_flat
+from echelon.agents.models.model import FlatBound
 from echelon.core.digits import at_least
 from echelon.core.errors import EchelonError
 from echelon.core.numerics import precision
@@ -700,3 +701,60 @@ def test_the_papers_starts_are_flown_without_a_limit_in_time(roots, speed, withi
         assert np.sqrt((error[result.times >= 8.0] ** 2).mean()) <= steady
         times.append(0.005 * (np.flatnonzero((error >= 0.01).any(axis=1))[-1] + 1))
     assert np.median(times) <= within
+
+
+class ListedBound(ech.models.PlanarQuadrotor):
+    """Somebody's model, which names the outputs of its border in a list."""
+
+    flat_chains = ech.models.PlanarQuadrotor.flat_chains
+
+    @property
+    def flat_bounds(self):
+        return (FlatBound(["z"], 2, -self.gravity, "roll"),)
+
+
+class NamedBound(ListedBound):
+    """The same in a tuple."""
+
+    @property
+    def flat_bounds(self):
+        return (FlatBound(("z",), 2, -self.gravity, "roll"),)
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (ListedBound(), NamedBound()),
+        (
+            ech.models.Quadrotor(inertia=[1.4e-5, 1.4e-5, 2.17e-5]),
+            ech.models.Quadrotor(inertia=(1.4e-5, 1.4e-5, 2.17e-5)),
+        ),
+    ],
+)
+def test_models_may_contain_lists(one, other):
+    def told(model):
+        drive = ech.Laws(ech.laws.StoppingLeader(), ech.laws.StoppingPoint())
+        goals = ech.Formation(np.zeros((3, len(model.state_names))))
+        graph = ech.Graph([(0, 1), (1, 2)])
+        parts = ech.Parts(model, graph, goals, drive, initial={model.position[0]: 0.1})
+        found = ech.guarantee(parts, ech.Settings(horizon=5.0, dt=0.01))
+        return found.kind, found.tube, {k: (x.text, x.number) for k, x in found.hypotheses.items()}
+
+    (kind, tube, lines), (same_kind, _, same_lines) = told(one), told(other)
+    assert tube is not None and kind is same_kind
+    names = type(one).__name__, type(other).__name__
+    assert [(t.replace(names[0], names[1]), n) for t, n in lines.values()] == [*same_lines.values()]
+
+
+def test_leaders_that_stay_apart_are_said_to_whatever_the_seed():
+    model = ech.models.DoubleIntegrator()
+    graph = ech.Graph([(0, 1), (1, 2), (2, 3), (3, 4)], leaders=[0, 4])
+    places = {k: [float(k), 0.0] for k in range(5)}
+    starts = np.array([[float(k), 0.0, 0.0, 0.0] for k in range(5)])
+    starts[4, 0] = 4.5
+    drive = ech.Laws(ech.laws.StoppingLeader(coupling=1e-10), ech.laws.StoppingPoint())
+    formation = ech.Formation.from_offsets(model, graph, places)
+    parts = ech.Parts(model, graph, formation, drive, initial=starts)
+    for seed in (0, 7):
+        found = ech.guarantee(parts, ech.Settings(horizon=5.0, dt=0.02, seed=seed))
+        assert found.hypotheses[Hypothesis.LEADERS_AGREE].fails and not found.promised

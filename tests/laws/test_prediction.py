@@ -85,3 +85,15 @@ def test_of_a_decay_all_digits_are_left_at_any_age(kind):
     before = fallen(np.asarray(v, kind).astype(float))
     off = np.abs(fallen(left) - before + np.asarray(falls, kind).astype(float))
     np.testing.assert_array_less(off, 16.0 * eps * (1.0 + np.abs(before) + falls))
+
+
+@pytest.mark.parametrize(("kind", "age"), [("float32", 90.0), ("float64", 800.0)])
+def test_a_decay_has_slopes_at_any_age(kind, age):
+    def left(start, coupling, age):
+        return saturated_decay(start[None], coupling, jnp.ones(1), age)[0]
+
+    with precision(kind):
+        for start in (1.0, 1e-9, 0.0):
+            numbers = (jnp.asarray(start), jnp.asarray(1.0), jnp.asarray(age))
+            slopes = jax.grad(left, argnums=(0, 1, 2))(*numbers)
+            np.testing.assert_allclose([left(*numbers), *slopes], 0.0, atol=1e-30)

@@ -16,6 +16,8 @@ import echelon as ech
 from echelon.agents.network.channel import Channel
 from echelon.agents.world.sensing import SensorStage
 from echelon.core.errors import EchelonError
+from echelon.core.statement import Hypothesis
+from echelon.core.words import Verdict
 from echelon.guarantees.promises.hypotheses import limits_act, other_limits, trim_line
 from echelon.output.archive.flight_folder import flight_files
 from echelon.simulation.step.motion import IdealMotors
@@ -446,3 +448,32 @@ class Broken(Fading):
 def test_what_is_no_event_is_refused(event, fault):
     with pytest.raises(EchelonError, match=fault):
         agreeing().replace(events=[event])
+
+
+class OffSensor(SensorStage):
+    """It reads half a metre too much."""
+
+    def read(self, model, memory, x, clock, number):
+        return x.at[0].add(0.5), memory
+
+
+class HalfMotors(IdealMotors):
+    """They deliver half of what is asked."""
+
+    def integrate(self, field, memory, x, u, plant):
+        return super().integrate(field, memory, x, 0.5 * u, plant)
+
+
+@pytest.mark.parametrize("part", [Sensed(OffSensor()), Driven(HalfMotors())])
+def test_of_silent_parts_no_line_says_that_states_are_exact_or_that_the_trim_is_delivered(part):
+    model, graph = ech.models.DoubleIntegrator(), ech.Graph([(0, 1), (1, 2)])
+    gain = ech.synthesize(model, graph, ech.gains.Riccati())
+    circle = ech.references.Circle(radius=2.0, rate=0.3)
+    drive = ech.Laws(ech.laws.Tracking(circle), ech.laws.Consensus(gain))
+    places = ech.Formation.from_offsets(model, graph, {1: [1.0, 0.0], 2: [2.0, 0.0]})
+    world = ech.World(parts=(part,))
+    parts = ech.Parts(model, graph, places, drive, initial={"position": 0.1}, world=world)
+    found = ech.guarantee(parts, ech.Settings(horizon=5.0, dt=0.02))
+    for name in (Hypothesis.EXACT_STATES, Hypothesis.TRIM_WITHIN_LIMITS):
+        assert found.hypotheses[name].verdict is not Verdict.HOLDS
+    assert type(part).__name__ in found.hypotheses[Hypothesis.EXACT_STATES].text

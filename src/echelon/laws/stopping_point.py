@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 from typing import final
 
 import equinox as eqx
@@ -56,7 +57,8 @@ def saturated_decay(
         p = 2.0 - b
         off = p - b * (a + target)
         a = a + off * p * b / (p**3 - off * (p * p - b * b))
-    grown = jnp.expm1(a)
+    # Nothing is left of a start long before e^a is infinite, and slopes are no numbers.
+    grown = jnp.expm1(jnp.minimum(a, math.log(float(jnp.finfo(start.dtype).max)) - 1.0))
     left = per_v * (1.0 / grown + 1.0 / (2.0 + grown))
     return start * jnp.where(linear, jnp.exp(-coupling * age), left)
 

@@ -22,6 +22,7 @@ from echelon.core.cache import memoize
 from echelon.core.compiled import cached_jit
 from echelon.core.digits import about, at_least, at_most
 from echelon.core.errors import GraphError
+from echelon.core.identity import process_key
 from echelon.core.linear import sampled_radius
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array
@@ -212,7 +213,14 @@ def of_leaders(
 
     @functools.wraps(function)
     def once(run: "StoppingRun", *args: _P.args, **named: _P.kwargs) -> _R:
-        key = function.__qualname__, args, tuple(named.items())
+        values: Hashable = args, tuple(named.items())
+        try:
+            hash(values)
+        except TypeError:  # such as a list that a user's model has
+            values = process_key(values)
+        if values is None:
+            return function(run.without_followers(), *args, **named)
+        key = function.__qualname__, values
         if key not in run.kept:
             run.kept[key] = function(run.without_followers(), *args, **named)
         return cast(_R, run.kept[key])
