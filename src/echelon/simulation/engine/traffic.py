@@ -20,7 +20,8 @@ from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import channel_of, prepare
 from echelon.simulation.step.assembly import assemble
 from echelon.simulation.step.deliveries import Empty, Radio, deliver, empty
-from echelon.simulation.step.networks import LateNetwork
+from echelon.simulation.step.leadership import leaders_of
+from echelon.simulation.step.networks import LateNetwork, MessageRules
 from echelon.simulation.step.roster import Links, roster_of
 from echelon.simulation.step.settings import Settings
 
@@ -76,11 +77,16 @@ def traffic(parts: Parts, settings: Settings, times: Array, steps: int) -> Traff
         links = Links.of(graph, settings, parts.leaderward)
         place = edges_of(graph, links.exchange)
         receives = parts.receives[place]
-        drive: Any = parts.drive
-        problem, roster = prepare(parts, settings).problem, roster_of(graph, settings, False)
-        network = assemble(problem, drive.leader, drive.follower).network
-        if not isinstance(network, LateNetwork):
-            return None  # nothing is known of the messages of one of a user's own
+        leadership = leaders_of(graph, parts.leadership)
+        rules = MessageRules.of(channel, leadership, graph.agents)
+        network, roster = LateNetwork(leadership, rules, channel), roster_of(graph, settings, False)
+        if parts.world.parts:
+            drive: Any = parts.drive
+            problem = prepare(parts, settings).problem
+            own = assemble(problem, drive.leader, drive.follower).network
+            if not isinstance(own, LateNetwork):
+                return None  # nothing is known of its messages
+            network = own
         radio = Radio(network, links, roster, np.asarray(settings.dt))
         followed = _follow(radio, receives, np.asarray(steps), ends.astype(np.int32))
         stamps, losses, counted = jax.tree.map(np.asarray, followed)
