@@ -340,18 +340,6 @@ class Mute(ech.WorldPart):
 """
 
 
-@pytest.mark.slow
-def test_a_medium_of_your_own_stays_after_a_change_of_the_network(tmp_path):
-    (tmp_path / "mute.py").write_text(MUTE)
-    more = {"network": {"rate": 50, "messages": "state"}, "parts": [{"python": "mute.py:Mute"}]}
-    own = scenario_from_mapping(copy.deepcopy(GIVEN) | more, tmp_path)
-    panel = Panel(own, build(own))
-    swarm = LiveLoop(*panel.experiment, panel.live)
-    swarm.apply(panel.start._replace(loss=0.2))
-    swarm.advance()
-    assert (np.asarray(swarm.now.memory.network[1].stamp) == NEVER).all()
-
-
 LOUD = """
 import dataclasses
 import numpy as np
@@ -359,7 +347,7 @@ import echelon as ech
 
 
 @dataclasses.dataclass(frozen=True)
-class Lossy(ech.WorldPart):
+class Mute(ech.WorldPart):
     def member(self, loop):
         none = dataclasses.replace(loop.network.medium, loss=np.asarray(1.0))
         return loop.with_medium(none)
@@ -367,9 +355,10 @@ class Lossy(ech.WorldPart):
 
 
 @pytest.mark.slow
-def test_what_a_part_of_your_own_makes_of_a_medium_stays_after_a_change_of_the_network(tmp_path):
-    (tmp_path / "loud.py").write_text(LOUD)
-    more = {"network": {"rate": 50, "messages": "state"}, "parts": [{"python": "loud.py:Lossy"}]}
+@pytest.mark.parametrize("code", [MUTE, LOUD], ids=["another medium", "a number of it"])
+def test_a_medium_of_your_own_stays_after_a_change_of_the_network(tmp_path, code):
+    (tmp_path / "mute.py").write_text(code)
+    more = {"network": {"rate": 50, "messages": "state"}, "parts": [{"python": "mute.py:Mute"}]}
     own = scenario_from_mapping(copy.deepcopy(GIVEN) | more, tmp_path)
     panel = Panel(own, build(own))
     swarm = LiveLoop(*panel.experiment, panel.live)

@@ -477,3 +477,10 @@ def test_of_silent_parts_no_line_says_that_states_are_exact_or_that_the_trim_is_
     for name in (Hypothesis.EXACT_STATES, Hypothesis.TRIM_WITHIN_LIMITS):
         assert found.hypotheses[name].verdict is not Verdict.HOLDS
     assert type(part).__name__ in found.hypotheses[Hypothesis.EXACT_STATES].text
+
+
+def test_beside_a_part_of_your_own_a_trim_that_actuators_lack_is_still_told():
+    parts, settings = ech.build(ech.load_scenario("paper", ["plant={scale: {mass: 3.0}}"]))
+    own = parts.replace(world=dataclasses.replace(parts.world, parts=(Sensed(OffSensor()),)))
+    assert trim_line(parts, settings).fails
+    assert trim_line(own, settings).fails

@@ -109,8 +109,6 @@ def trim_line(parts: Parts, settings: Settings) -> Statement:
     asked = (part.off_trim(plant, trim) for part in world.all_parts for plant in plants)
     for text, remedy in filter(any, asked):
         return fails(name, Kind.PROOF, text, remedy=remedy, reason=f"{text}: no agent holds it")
-    if any(part.presumed() for part in world.parts):
-        return unneeded(name, Kind.PROOF, "what parts of your own make of inputs is not known")
     if not (settings.limits and any(map(is_limited, plants))):
         return unneeded(name, Kind.PROOF, "the inputs have no limits")
     short = dict[str, Shortfall]()
@@ -124,6 +122,8 @@ def trim_line(parts: Parts, settings: Settings) -> Statement:
             text, remedy = text + listing(stuck), "give the actuators a margin about the trim"
             # No small error gets the input that it asks for.
             return fails(name, Kind.PROOF, text, 0.0, "0 %", remedy=remedy, reason=text)
+        if any(part.presumed() for part in world.parts):
+            return unneeded(name, Kind.PROOF, "what parts of your own make of inputs is not known")
         text = "the actuators deliver the trim input with a margin on both sides"
         return holds(name, Kind.PROOF, text)
     units = dict(zip(model.input_names, model.input_units, strict=True))
@@ -140,7 +140,7 @@ def _exact(case: GuaranteeInputs) -> Statement:
     """Assumption 3: states are known exactly, and nothing acts that no law asked for."""
     acts = case.parts.world.ignored
     if not case.ignored and case.local is not None and acts:
-        text = f"{' and '.join(acts)}, in the steps that were examined"
+        text = f"{' and '.join(acts)}; the steps that were examined contain this"
         return unneeded(Hypothesis.EXACT_STATES, _LINEAR, text)
     if not case.ignored:
         text = "states are known exactly, and nothing disturbs the agents"
